@@ -19,7 +19,7 @@ from sern_client.bridge import Bridge
 from sern_client.checks import TableCheck
 from sern_client.client_metrics import Counting, register_client
 from sern_client.connection import Connection
-from sern_client.endpoints.base import Endpoint, ServedEndpoint
+from sern_client.endpoints.base import Endpoint, ObjectEndpoint, ServedEndpoint
 from sern_client.endpoints.composite import with_services
 from sern_client.factory import make_endpoint, make_link_topics
 from sern_client.guard import Guard
@@ -28,6 +28,7 @@ from sern_client.link_state import LinkState
 from sern_client.objects_view import objects_view
 from sern_client.services import ServiceBridge
 from sern_client.site import Site
+from sern_client.site_objects import CoreObjects
 from sern_client.tables import Tables
 from sern_core.bodies.lossy import missing
 from sern_core.objects.feed import PERIOD_S
@@ -124,6 +125,8 @@ class ClientDaemon:
             withdraws=state.withdraw_after_s is not None,
         )
         self.core = self.bridge.core
+        if isinstance(endpoint, ObjectEndpoint):
+            endpoint.use_objects(CoreObjects(self.core, self._kick))
         self.core.subscribe(model.subscribe_patterns(), now=now)
         self.core.subscribe_objects([section.selection() for section in model.objects], now=now)
         self.adaptation = self._make_adaptation()

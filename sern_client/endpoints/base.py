@@ -10,8 +10,9 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Protocol, runtime_checkable
 
+from sern_core.site.object_mirror import ObjectListener
 from sern_core.vocabulary.message import TopicInfo
-from sern_core.vocabulary.types import DropReason, Encoding, TopicName
+from sern_core.vocabulary.types import DropReason, Encoding, ObjectKind, TopicName
 
 if TYPE_CHECKING:
     from sern_runtime.metrics import Metrics
@@ -175,6 +176,35 @@ class ServedEndpoint(Protocol):
     def json_routes(self) -> Mapping[str, Callable[[], object]]:
         """What to serve, by path."""
         ...
+
+
+class SiteObjects(Protocol):
+    """The cross-reality objects of this client, and those of others that it subscribes to."""
+
+    def put(
+        self,
+        object_id: str,
+        kind: ObjectKind,
+        type_name: str,
+        *,
+        value: bytes = b"",
+        attributes: dict[str, str] | None = None,
+        ros_stamp_ns: int | None = None,
+    ) -> None:
+        """Create or replace one of our own. UsageError, RefusedError: it is too large, or there are too many."""
+
+    def delete(self, object_id: str) -> bool: ...
+
+    def listen(self, listener: ObjectListener) -> None:
+        """Have it told of changes of others' objects from now on."""
+
+
+@runtime_checkable
+class ObjectEndpoint(Protocol):
+    """An endpoint with objects of its own."""
+
+    def use_objects(self, objects: SiteObjects) -> None:
+        """Once, before `start`."""
 
 
 KeptUpTo = Callable[[int, Mapping[int, DropReason]], None]

@@ -53,6 +53,10 @@ class TwinEndpoint(EndpointBase):
     unity: bool = False
     """Also PREFIX/NAME/unity, geometry_msgs/PoseStamped: the twin in Unity's axes, x east, y up, z north."""
 
+    objects: bool = True
+    """Also as objects PREFIX/NAME of kind robot, twice a second: the twin to be shown, how old and how far off it may
+    be, for whoever subscribes to objects."""
+
     @model_validator(mode="after")
     def _apart(self) -> "TwinEndpoint":
         seen: Counter[str] = Counter()

@@ -30,7 +30,7 @@ async def test_a_site_gets_the_twin_of_a_robot(tmp_path: Path, encoding: str) ->
     rule = {"match": "/odometry/filtered", "class": "control"}
     async with Lab(tmp_path, "robot1", "twin", "site") as lab:
         await lab.relay()
-        site = await lab.connected(lab.recorder_file("site", "/twin/.*"))
+        site = await lab.connected(lab.recorder_file("site", "/twin/.*", objects=[{"kind": "robot"}]))
         twin = await lab.connected(
             lab.client_file("twin", TWIN, client={"namespace": "/"}, discovery={"mode": "manual"})
         )
@@ -44,6 +44,9 @@ async def test_a_site_gets_the_twin_of_a_robot(tmp_path: Path, encoding: str) ->
         pose = source.state().pose
         assert math.dist((shown.shown.x_m, shown.shown.y_m), (pose.x_m, pose.y_m)) < 0.5
         assert endpoint.robots["robot1"].counts["taken"] > 10
+        objects = site.core.mirror.objects
+        await until(lambda: "/twin/robot1" in objects)
+        assert "s old, error at most" in objects["/twin/robot1"].attributes["says"]
         assert {f"/twin/robot1/{part}" for part in ("odom", "estimate", "age", "error")} <= set(arrived)
 
 

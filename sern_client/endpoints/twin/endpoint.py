@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-from sern_client.endpoints.base import Difference, Held, Sink, TopicEvents
+from sern_client.endpoints.base import Difference, Held, Sink, SiteObjects, TopicEvents
 from sern_client.endpoints.common.held import HeldSubscription
 from sern_client.endpoints.common.saying import SayOnce, say_failure
 from sern_client.endpoints.twin import bodies
@@ -29,7 +29,7 @@ from sern_client.endpoints.twin.robot import RobotTwin
 from sern_core.vocabulary.errors import BodyError, ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.names import plain_type
-from sern_core.vocabulary.types import DropReason, Encoding, TopicName
+from sern_core.vocabulary.types import DropReason, Encoding, ObjectKind, TopicName
 from sern_runtime import clock, ros_types
 from sern_runtime.entry import end_tasks
 from sern_runtime.metrics import Metrics
@@ -49,6 +49,8 @@ TYPES: Final = {
     "status": bodies.DIAGNOSTICS,
     "unity": bodies.POSE,
 }
+LEVELS: Final = ("ok", "warn", "error", "stale")
+"""Of diagnostic_msgs/DiagnosticStatus, in words."""
 SLOW: Final = frozenset({"path", "status"})
 
 
@@ -109,7 +111,11 @@ class TwinEndpoint:
         self._hearers: list[_Hearer] = []
         self._said = SayOnce(_log)
         self._drops: Counter[DropReason] = Counter()
+        self._objects: SiteObjects | None = None
         self._task: asyncio.Task[None] | None = None
+
+    def use_objects(self, objects: SiteObjects) -> None:
+        self._objects = objects
 
     async def start(self, events: TopicEvents) -> None:
         for topic in self._topics.values():
@@ -217,6 +223,9 @@ class TwinEndpoint:
         """Everything that somebody wants of the twins as they are now."""
         now, wall_ns = self._now(), self._wall_ns()
         twins = {name: robot.twin(now=now) for name, robot in self.robots.items()}
+        if slow and self._objects is not None and self._options.objects:
+            for name, twin in twins.items():
+                self._put(self._objects, self.robots[name], twin, wall_ns)
         for topic in self._topics.values():
             if not topic.subscriptions or (topic.part in SLOW and not slow):
                 continue
@@ -227,6 +236,31 @@ class TwinEndpoint:
             for subscription in list(topic.subscriptions):
                 if not subscription.sink(body, wall_ns):
                     self._drops[DropReason.REFUSED] += 1
+
+    def _put(self, objects: SiteObjects, robot: RobotTwin, twin: Twin | None, wall_ns: int) -> None:
+        """The object of a robot; there is none before the robot was heard."""
+        if twin is None:
+            return
+        name, shown = robot.options.name, twin.shown
+        level, text, _values = _words(robot, twin)
+        objects.put(
+            f"{self._options.prefix}/{name}",
+            ObjectKind.ROBOT,
+            bodies.ODOMETRY,
+            value=self._body(robot, "odom", twin, self._now(), wall_ns) or b"",
+            attributes={
+                "says": text,
+                "level": LEVELS[level],
+                "age_s": f"{twin.age_s:.2f}",
+                "error_m": f"{twin.error_m:.3f}",
+                "x_m": f"{shown.x_m:.3f}",
+                "y_m": f"{shown.y_m:.3f}",
+                "yaw_rad": f"{shown.yaw_rad:.4f}",
+                "frame_id": robot.frame.frame_id,
+                "encoding": self._encoding.value,
+            },
+            ros_stamp_ns=wall_ns,
+        )
 
     def _body(self, robot: RobotTwin, part: str, twin: Twin | None, now: float, wall_ns: int) -> bytes | None:
         """None before the robot was heard, but for its status."""

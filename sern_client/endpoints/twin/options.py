@@ -22,3 +22,4 @@ class TwinOptions:
     ahead_s: float = 5.0
     prefix: str = "/twin"
     unity: bool = False
+    objects: bool = True

@@ -13,7 +13,7 @@ from sern_client.endpoints.twin.endpoint import TYPES, TwinEndpoint
 from sern_client.endpoints.twin.options import RobotOptions, TwinOptions
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
-from sern_core.vocabulary.types import DropReason, Encoding, TopicName
+from sern_core.vocabulary.types import DropReason, Encoding, ObjectKind, TopicName
 from sern_runtime import ros_types
 from sern_twin.motion import Motion, Twist
 from tests.support import until
@@ -110,6 +110,42 @@ def test_a_twin_is_where_the_robot_is_by_now(encoding: Encoding) -> None:
     assert ord(status.level) if isinstance(status.level, bytes) else status.level == 0
     assert status.message == f"0.20 s old, error at most {error:.2f} m"
     assert {each.key: each.value for each in status.values}["poses_taken"] == "60"
+
+
+class Objects:
+    """`SiteObjects` that keeps what was put."""
+
+    def __init__(self) -> None:
+        self.put_last: dict[str, dict[str, Any]] = {}
+
+    def put(self, object_id: str, kind: ObjectKind, type_name: str, **fields: Any) -> None:
+        self.put_last[object_id] = {"kind": kind, "type": type_name, **fields}
+
+    def delete(self, object_id: str) -> bool:
+        return self.put_last.pop(object_id, None) is not None
+
+    def listen(self, listener: object) -> None: ...
+
+
+def test_the_contract_is_in_the_object_of_a_robot() -> None:
+    world, objects = World(), Objects()
+    world.endpoint.use_objects(objects)
+    world.endpoint.publish(slow=True)
+    assert objects.put_last == {}, "it was not heard yet"
+    drive(world, world.publisher("/jackal1/odom"), 0.0, 3.0)
+    world.now += 4.0
+    world.endpoint.publish(slow=False)
+    assert objects.put_last == {}
+    world.endpoint.publish(slow=True)
+    ((object_id, told),) = objects.put_last.items()
+    assert (object_id, told["kind"], told["type"]) == ("/twin/jackal1", ObjectKind.ROBOT, bodies.ODOMETRY)
+    odom = world.got["/twin/jackal1/odom"][-1]
+    shown = ros_types.deserialise(told["value"], bodies.ODOMETRY, world.encoding)
+    assert shown.pose.pose.position.x == odom.pose.pose.position.x
+    fields = told["attributes"]
+    assert fields["says"] == f"{fields['age_s']} s old, error at most {float(fields['error_m']):.2f} m"
+    assert float(fields["age_s"]) == pytest.approx(4.0) and fields["level"] == "warn"
+    assert float(fields["x_m"]) == pytest.approx(odom.pose.pose.position.x, abs=0.001)
 
 
 def test_before_it_is_heard_there_is_its_status_alone() -> None:
