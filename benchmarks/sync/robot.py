@@ -7,24 +7,16 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from sern_sim.follower import Follower, Reference
-from sern_sim.robot import STEP_S, Pose2, SimulatedJackal
+from sern_sim.follower import Reference
+from sern_sim.pilot import YAW_SCALE, Pilot
+from sern_sim.robot import Pose2, SimulatedJackal
 from sern_sim.world import World
 from sern_twin.motion import TAU, Motion, Twist
 from sern_twin.trajectory import Trajectory, Waypoint
 
 EMPTY: Final = World(np.zeros((0, 5)), np.zeros((0, 4)), 1e6)
-OFF_M: Final = 0.01
-OFF_RAD: Final = math.radians(0.3)
-OFF_S: Final = 2.0
-"""What the localisation is off in each axis, and how long it stays so: one sigma, and the time constant."""
-NOISE_M: Final = 0.003
-NOISE_MPS: Final = 0.01
-NOISE_RADPS: Final = 0.01
 NOISE_MPS2: Final = 0.05
-"""What each pose is off beside that."""
-YAW_SCALE: Final = 0.45
-"""What the robot's maker thinks that its base makes of a turn. The plant's is between 0.35 and 0.55."""
+"""What the robot's measure of its acceleration is off; one sigma."""
 WAYPOINT_S: Final = 0.5
 RAMP_S: Final = 1.0
 FINE_S: Final = 0.01
@@ -69,41 +61,23 @@ class Robot:
         self._way = way
         self._stops_s = stops_s
         self._plant = SimulatedJackal(random, world=EMPTY)
-        self._follower = Follower(YAW_SCALE)
-        self._off = [random.gauss(0.0, OFF_M), random.gauss(0.0, OFF_M), random.gauss(0.0, OFF_RAD)]
+        self._pilot = Pilot(random, self._plant, self._planned)
+
+    def _planned(self, time_s: float) -> Reference:
+        planned = self._way.at(time_s)
+        pose = Pose2(planned.x_m, planned.y_m, planned.yaw_rad)
+        return Reference(pose, planned.twist.forward_mps, planned.twist.yaw_radps)
 
     def step(self) -> Said:
-        random, before = self._random, self._plant.state
-        kept = math.exp(-STEP_S / OFF_S)
-        new = math.sqrt(1 - kept**2)
-        for axis, sigma in enumerate((OFF_M, OFF_M, OFF_RAD)):
-            self._off[axis] = kept * self._off[axis] + new * random.gauss(0.0, sigma)
-        off_x_m, off_y_m, off_rad = self._off
-        pose = before.pose
-        found = Pose2(
-            pose.x_m + off_x_m + random.gauss(0.0, NOISE_M),
-            pose.y_m + off_y_m + random.gauss(0.0, NOISE_M),
-            math.remainder(pose.yaw_rad + off_rad, TAU),
-        )
-        planned = self._way.at(before.time_s)
-        command = self._follower.command(
-            Reference(
-                Pose2(planned.x_m, planned.y_m, planned.yaw_rad), planned.twist.forward_mps, planned.twist.yaw_radps
-            ),
-            found,
-            before.yaw_rate_radps + random.gauss(0.0, NOISE_RADPS),
-        )
-        if before.time_s >= self._stops_s:
-            command = 0.0, 0.0
-        self._plant.drive(*command)
-        self._plant.step()
+        before = self._plant.state
+        found = self._pilot.step(stands=before.time_s >= self._stops_s)
+        pose, command = before.pose, self._pilot.told
         twist = Twist(before.speed_mps, 0.0, before.yaw_rate_radps)
-        measured = Twist(
-            before.speed_mps + random.gauss(0.0, NOISE_MPS), 0.0, before.yaw_rate_radps + random.gauss(0.0, NOISE_RADPS)
-        )
+        measured = Twist(found.speed_mps, 0.0, found.yaw_rate_radps)
+        accel_mps2 = before.accel_mps2 + self._random.gauss(0.0, NOISE_MPS2)
         return Said(
             before.time_s,
             Motion(pose.x_m, pose.y_m, pose.yaw_rad, twist),
-            Motion(found.x_m, found.y_m, found.yaw_rad, measured, before.accel_mps2 + random.gauss(0.0, NOISE_MPS2)),
+            Motion(found.pose.x_m, found.pose.y_m, found.pose.yaw_rad, measured, accel_mps2),
             Twist(command[0], 0.0, command[1] * YAW_SCALE),
         )

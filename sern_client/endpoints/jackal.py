@@ -22,6 +22,7 @@
 | /path | nav_msgs/Path, the last 100 s | 1, bulk | reliable |
 | /temperature | sensor_msgs/Temperature | 1 | best effort |
 | /e_stop | std_msgs/Bool | once | reliable, latched |
+| /plan | nav_msgs/Path with times, the next 90 s; only of a robot that follows one | 1/30 | reliable, latched |
 
 In ROS 1 a publisher does not say whether it is reliable, so there `reliable` is None. Frames: map = odom, base_link,
 imu_link, velodyne, camera.
@@ -40,6 +41,8 @@ import numpy as np
 from sern_client.endpoints.clouds import CLOUD_TYPE, CloudSource, cloud_body
 from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
+from sern_sim.follower import Reference
+from sern_sim.pilot import OFF_M, FigureOfEight, Pilot
 from sern_sim.robot import GRAVITY_MPS2, GYRO_NOISE_RADPS, STEP_S, Pose2, SimulatedJackal
 
 ORIGIN_DEG: Final = (48.135, 10.068)
@@ -85,6 +88,9 @@ JACKAL: Final = (
 )
 
 
+PLAN: Final = Plan("/plan", "nav_msgs/msg/Path", 1 / 30, True, latched=True)
+
+
 @dataclass(frozen=True, slots=True)
 class Sizes:
     """Bytes of the heavy bodies, each within one element of what is asked (16 per point, 1 per cell, 3 per pixel)."""
@@ -98,10 +104,24 @@ class JackalSource:
     """Makes the bodies of `JACKAL` from a simulated robot. The same seed, calls and stamps give the same bytes."""
 
     def __init__(
-        self, random: Random, encoding: Encoding, sizes: Sizes, *, patrol: bool, cloud_files: tuple[Path, ...] = ()
+        self,
+        random: Random,
+        encoding: Encoding,
+        sizes: Sizes,
+        *,
+        patrol: bool,
+        cloud_files: tuple[Path, ...] = (),
+        follow: bool = False,
+        localisation_noise_m: float = OFF_M,
     ) -> None:
+        """`follow`: it drives by a plan, and its odometry is where a localisation thinks it is."""
         self.robot = SimulatedJackal(random, patrol=patrol)
         self._random = Random(random.getrandbits(64))
+        self._way: FigureOfEight | None = None
+        self._pilot: Pilot | None = None
+        if follow:
+            self._way = FigureOfEight(self._random, self.robot.state.pose, 0.0)
+            self._pilot = Pilot(self._random, self.robot, self._planned, off_m=localisation_noise_m)
         self._sizes = sizes
         self._clouds = CloudSource(cloud_files, encoding) if cloud_files else None
         self._new = partial(_make, encoding)
@@ -130,12 +150,43 @@ class JackalSource:
             "/path": self._path_message,
             "/temperature": self._temperature,
             "/e_stop": self._e_stop,
+            "/plan": self._plan_message,
         }
 
     def advance(self, to_s: float) -> None:
         """Run the robot to `to_s` seconds after its start."""
         while self.robot.state.time_s + STEP_S <= to_s + 1e-9:
-            self.robot.step()
+            if self._pilot is None:
+                self.robot.step()
+            else:
+                self._pilot.step()
+
+    def _planned(self, time_s: float) -> Reference:
+        assert self._way is not None
+        return self._way.at(time_s)
+
+    def drive(self, speed_mps: float, yaw_rate_radps: float) -> None:
+        """A velocity command, in force until the next, or until `release`. Not a finite number: ValueError."""
+        self.robot.drive(speed_mps, yaw_rate_radps)
+        if self._pilot is not None:
+            self._pilot.held = True
+
+    def release(self) -> bool:
+        """Commands have ceased: it stands, or makes a new plan from where it is. Whether there is a new plan."""
+        self.robot.drive(0.0, 0.0)
+        if self._pilot is None or not self._pilot.held:
+            return False
+        self._pilot.held = False
+        self._way = FigureOfEight(self._random, self._pilot.found.pose, self.robot.state.time_s)
+        return True
+
+    def _where(self) -> tuple[Pose2, float, float]:
+        """Where it thinks it is: pose, speed and yaw rate."""
+        if self._pilot is None:
+            state = self.robot.state
+            return state.pose, state.speed_mps, state.yaw_rate_radps
+        found = self._pilot.found
+        return found.pose, found.speed_mps, found.yaw_rate_radps
 
     def body(self, plan: Plan, stamp_ns: int) -> bytes:
         """The message of a topic as of now; `stamp_ns` goes into its header."""
@@ -184,8 +235,7 @@ class JackalSource:
 
     # Topics
 
-    def _odometry(self, stamp_ns: int, seq: int, pose: Pose2, sigma: float) -> Any:
-        state = self.robot.state
+    def _odometry(self, stamp_ns: int, seq: int, pose: Pose2, sigma: float, twist: tuple[float, float]) -> Any:
         covariance = np.diag([sigma, sigma, 1e6, 1e6, 1e6, sigma]).reshape(-1)
         where, moving = "geometry_msgs/msg/PoseWithCovariance", "geometry_msgs/msg/TwistWithCovariance"
         return self._new(
@@ -193,14 +243,16 @@ class JackalSource:
             header=self._header(stamp_ns, "odom", seq),
             child_frame_id="base_link",
             pose=self._new(where, pose=self._pose_of(pose), covariance=covariance),
-            twist=self._new(moving, twist=self._twist(state.speed_mps, state.yaw_rate_radps), covariance=covariance),
+            twist=self._new(moving, twist=self._twist(*twist), covariance=covariance),
         )
 
     def _odometry_true(self, stamp_ns: int, seq: int) -> Any:
-        return self._odometry(stamp_ns, seq, self.robot.state.pose, 1e-4)
+        pose, *twist = self._where()
+        return self._odometry(stamp_ns, seq, pose, 1e-4, (twist[0], twist[1]))
 
     def _odometry_wheels(self, stamp_ns: int, seq: int) -> Any:
-        return self._odometry(stamp_ns, seq, self.robot.state.odometry, 1e-2)
+        state = self.robot.state
+        return self._odometry(stamp_ns, seq, state.odometry, 1e-2, (state.speed_mps, state.yaw_rate_radps))
 
     def _imu(self, stamp_ns: int, seq: int) -> Any:
         yaw_rate, forward, left = self.robot.imu()
@@ -215,7 +267,7 @@ class JackalSource:
 
     def _tf(self, stamp_ns: int, seq: int) -> Any:
         del seq
-        moved = self._transform(stamp_ns, "base_link", self.robot.state.pose, parent="odom")
+        moved = self._transform(stamp_ns, "base_link", self._where()[0], parent="odom")
         return self._new("tf2_msgs/msg/TFMessage", transforms=[moved])
 
     def _tf_static(self, stamp_ns: int, seq: int) -> Any:
@@ -354,6 +406,15 @@ class JackalSource:
     def _path_message(self, stamp_ns: int, seq: int) -> Any:
         self._path.append((stamp_ns, self.robot.state.pose))
         poses = [self._stamped_pose(at_ns, 0, pose) for at_ns, pose in self._path]
+        return self._new("nav_msgs/msg/Path", header=self._header(stamp_ns, "odom", seq), poses=poses)
+
+    def _plan_message(self, stamp_ns: int, seq: int) -> Any:
+        assert self._way is not None
+        now_s = self.robot.state.time_s
+        poses = [
+            self._stamped_pose(stamp_ns + round((time_s - now_s) * 1e9), 0, pose)
+            for time_s, pose in self._way.waypoints()
+        ]
         return self._new("nav_msgs/msg/Path", header=self._header(stamp_ns, "odom", seq), poses=poses)
 
     def _temperature(self, stamp_ns: int, seq: int) -> Any:

@@ -18,12 +18,13 @@ from sern_client.endpoints.base import Difference, Held, Sink, TopicEvents
 from sern_client.endpoints.clock import Clock, SystemClock
 from sern_client.endpoints.common.held import HeldSubscription
 from sern_client.endpoints.common.saying import say_failure
-from sern_client.endpoints.jackal import JACKAL, JackalSource, OperatorSource, Plan, Sizes
+from sern_client.endpoints.jackal import JACKAL, PLAN, JackalSource, OperatorSource, Plan, Sizes
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.entry import end_tasks
+from sern_sim.pilot import OFF_M
 from sern_sim.robot import STEP_S, RobotState
 
 COUNTER_RATE_HZ: Final = 5.0
@@ -45,7 +46,9 @@ class SyntheticOptions:
     """`topics`: the first n of the table, or names from it. `load_factor` multiplies the rates of bulk topics.
     `commands` are the topics the robot drives by. `counter_topics` are extra reliable std_msgs/String topics at 5 Hz
     whose text is `<topic> <n>`, n = 1, 2, 3... without a gap. `command_timeout_s` stops the robot when commands cease;
-    None leaves that to whoever guards the link. The fields from `command_topic` on are the operator's.
+    None leaves that to whoever guards the link. `follow`: it drives by a plan, which it publishes, in closed loop with
+    a localisation that is off by `localisation_noise_m`; commands come first, and after their end there is a new plan.
+    The fields from `command_topic` on are the operator's.
     """
 
     seed: int = 0
@@ -63,6 +66,8 @@ class SyntheticOptions:
     load_factor: float = 1.0
     commands: tuple[str, ...] = ("/cmd_vel",)
     command_timeout_s: float | None = None
+    follow: bool = False
+    localisation_noise_m: float = OFF_M
     counter_topics: tuple[str, ...] = ()
     command_topic: str = "/cmd_vel"
     command_stamped: bool = False
@@ -155,7 +160,13 @@ class SyntheticEndpoint:
         if options.role == "robot":
             sizes = Sizes(options.cloud_bytes, options.map_bytes, options.image_bytes)
             self._source = self._robot = JackalSource(
-                random, self._encoding, sizes, patrol=options.patrol, cloud_files=options.cloud_files
+                random,
+                self._encoding,
+                sizes,
+                patrol=options.patrol,
+                cloud_files=options.cloud_files,
+                follow=options.follow,
+                localisation_noise_m=options.localisation_noise_m,
             )
         else:
             self._source = OperatorSource(random, self._encoding)
@@ -264,6 +275,8 @@ class SyntheticEndpoint:
             raise ConfigError("rates and load_factor must not be negative")
         if options.role == "robot":
             topics = [self._topic(self._rated(plan)) for plan in _chosen(options.topics)]
+            if options.follow:
+                topics.append(self._topic(PLAN))
         else:
             twist = "geometry_msgs/msg/TwistStamped" if options.command_stamped else "geometry_msgs/msg/Twist"
             goal = Plan(options.goal_topic, "geometry_msgs/msg/PoseStamped", options.goal_rate_hz, reliable=True)
@@ -320,8 +333,8 @@ class SyntheticEndpoint:
         timeout_s = self.options.command_timeout_s
         if timeout_s is not None and self._commanded_s is not None and to_s - self._commanded_s > timeout_s:
             self._commanded_s = None
-            if self._robot is not None:
-                self._robot.robot.drive(0.0, 0.0)
+            if self._robot is not None and self._robot.release():
+                self._publish(self._topics[TopicName(PLAN.name)], to_s)
         self._source.advance(to_s)
 
     def _publish(self, topic: _Topic, at_s: float) -> None:
@@ -379,7 +392,7 @@ class SyntheticEndpoint:
         try:
             message = ros_types.deserialise(body, info.type_name, info.encoding)
             twist = message.twist if info.type_name.endswith("TwistStamped") else message
-            self._robot.robot.drive(float(twist.linear.x), float(twist.angular.z))
+            self._robot.drive(float(twist.linear.x), float(twist.angular.z))
         except (ConfigError, ValueError) as error:
             self.counters.bad_commands += 1
             if self.counters.bad_commands == 1:

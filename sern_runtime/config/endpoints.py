@@ -125,6 +125,12 @@ class SyntheticEndpoint(EndpointBase):
     """How many of its topics the robot publishes, most urgent first, or their names."""
     patrol: bool = False
     """The robot drives a round by itself while it has no commands."""
+    follow: bool = False
+    """The robot drives by a plan of its own, in closed loop, and publishes it as /plan (nav_msgs/Path with times, 90 s
+    ahead). Commands come first; once they cease for `command_timeout_s` it makes a new plan from where it is. /pose is
+    where it truly is, and its odometry where its localisation thinks it is."""
+    localisation_noise_m: Annotated[float, Field(ge=0, le=1)] = 0.01
+    """What the localisation of a robot with `follow` is off in each axis, one sigma; in yaw 0.3° for each cm."""
     cloud_bytes: Annotated[int, Field(ge=1000, le=50_000_000)] = 100_000
     """Size of one point cloud."""
     cloud_rate_hz: HertzOrOff = 10.0

@@ -137,6 +137,8 @@ class RobotTwin:
             except BodyError:
                 self.refused["bad"] += 1
                 raise
+            for stamp_s, motion in self._heard:  # of a plan that goes on where the one before ended all is known
+                self._following.heard(stamp_s, motion)
         finally:
             self._learned_s = -math.inf
             self._learn(now)

@@ -2,13 +2,15 @@
 
 import asyncio
 import logging
+import math
 from collections.abc import Awaitable, Callable
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import pytest
 
-from sern_client.endpoints.jackal import JACKAL
+from sern_client.endpoints.jackal import JACKAL, PLAN, JackalSource, Plan, Sizes
 from sern_client.endpoints.synthetic import SyntheticEndpoint, SyntheticOptions
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
@@ -292,3 +294,50 @@ async def test_misuse(events: Any) -> None:
         endpoint.subscribe(TopicName("/points"), lambda body, stamp_ns: True)
     assert not endpoint.exhausted
     await endpoint.stop()
+
+
+def follower(noise_m: float = 0.01) -> JackalSource:
+    return JackalSource(Random(4), Encoding.CDR, Sizes(), patrol=False, follow=True, localisation_noise_m=noise_m)
+
+
+def read(source: JackalSource, plan: Plan, stamp_ns: int = 10**18) -> Any:
+    return ros_types.deserialise(source.body(plan, stamp_ns), plan.type_name, Encoding.CDR)
+
+
+def test_a_robot_that_follows_a_plan_is_where_the_plan_had_it() -> None:
+    source = follower()
+    source.advance(1.0)
+    plan = read(source, PLAN)
+    times_s = [pose.header.stamp.sec + pose.header.stamp.nanosec / 1e9 - 1e9 for pose in plan.poses]
+    assert times_s[-1] > 60 and times_s == sorted(times_s)
+    for number in (20, 60, 100):
+        source.advance(1.0 + times_s[number])
+        true, planned = source.robot.state.pose, plan.poses[number].pose.position
+        assert math.dist((true.x_m, true.y_m), (planned.x, planned.y)) < 0.1
+
+
+def test_its_odometry_is_where_it_thinks_it_is_and_its_pose_where_it_is() -> None:
+    source = follower(0.05)
+    odometry, pose = (next(plan for plan in JACKAL if plan.name == name) for name in ("/odometry/filtered", "/pose"))
+    apart_m = []
+    for step in range(200):
+        source.advance(step * 0.2)
+        said, true = read(source, odometry).pose.pose.position, read(source, pose).pose.position
+        assert (true.x, true.y) == (source.robot.state.pose.x_m, source.robot.state.pose.y_m)
+        apart_m.append(math.dist((said.x, said.y), (true.x, true.y)))
+    assert 0.02 < sum(apart_m) / len(apart_m) < 0.2
+
+
+def test_after_commands_it_makes_a_new_plan_from_where_it_is() -> None:
+    source = follower()
+    source.advance(5.0)
+    before = read(source, PLAN)
+    source.drive(0.5, 0.0)
+    source.advance(7.0)
+    assert source.release() and not source.release()
+    after = read(source, PLAN)
+    true, first = source.robot.state.pose, after.poses[0].pose.position
+    assert math.dist((true.x_m, true.y_m), (first.x, first.y)) < 0.1
+    assert [pose.pose.position.x for pose in after.poses[:20]] != [pose.pose.position.x for pose in before.poses[4:24]]
+    source.advance(60.0)
+    assert source.robot.state.travelled_m > 20
