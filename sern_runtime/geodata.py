@@ -64,7 +64,6 @@ def read_elevation(path: Path, *, crs: str | None = None, near: Grid | None = No
     above the zero that they have. ConfigError: not there, no raster, no reference system, too large, not near.
     """
     _need("elevation", path, "rasterio", "pyproj", "scipy")
-    import pyproj
     import rasterio
     import rasterio.errors
     from rasterio.windows import Window
@@ -90,16 +89,17 @@ def read_elevation(path: Path, *, crs: str | None = None, near: Grid | None = No
                         file=file,
                     )
                 heights = source.read(1, window=window, masked=True).astype(np.float64).filled(np.nan)
-                transform = source.window_transform(window)
+                transform = source.transform
     except rasterio.errors.RasterioError as error:
         raise ConfigError(f"is no raster that can be read: {_first_line(error)}", file=file) from error
-    columns, rows = np.meshgrid(np.arange(window.width) + 0.5, np.arange(window.height) + 0.5)
+    columns, rows = np.meshgrid(
+        window.col_off + np.arange(window.width) + 0.5, window.row_off + np.arange(window.height) + 0.5
+    )
     across, along = (
         transform.a * columns + transform.b * rows + transform.c,
         transform.d * columns + transform.e * rows + transform.f,
     )
-    to_degrees = pyproj.Transformer.from_crs(system, _DEGREES, always_xy=True)
-    longitudes, latitudes = to_degrees.transform(across, along)
+    longitudes, latitudes = _to_degrees(system, file).transform(across, along)
     try:
         return ElevationRaster(heights, np.radians(latitudes), np.radians(longitudes))
     except UsageError as error:
@@ -221,9 +221,21 @@ def _system(said: str | None, file: str) -> Any:
     return system
 
 
+def _to_degrees(system: Any, file: str) -> Any:
+    """From places in a reference system to longitude and latitude."""
+    import pyproj
+    import pyproj.exceptions
+
+    try:
+        return pyproj.Transformer.from_crs(system, _DEGREES, always_xy=True)
+    except pyproj.exceptions.ProjError as error:
+        raise ConfigError(
+            f"its reference system {system.name} cannot be turned into latitude and longitude: reproject it", file=file
+        ) from error
+
+
 def _window(near: Grid, system: Any, source: Any, file: str) -> Any:
     """The pixels around a grid."""
-    import pyproj
     from rasterio.windows import Window
 
     if near.plane is None:
@@ -236,8 +248,8 @@ def _window(near: Grid, system: Any, source: Any, file: str) -> Any:
     )
     east, north = np.meshgrid(across, along)
     geodetic = near.to_geodetic(np.stack((east, north, np.zeros(east.shape)), axis=-1))
-    from_degrees = pyproj.Transformer.from_crs(_DEGREES, system, always_xy=True)
-    places = from_degrees.transform(np.degrees(geodetic[..., 1]).ravel(), np.degrees(geodetic[..., 0]).ravel())
+    longitudes, latitudes = np.degrees(geodetic[..., 1]).ravel(), np.degrees(geodetic[..., 0]).ravel()
+    places = _to_degrees(system, file).transform(longitudes, latitudes, direction="INVERSE")
     inverse = ~source.transform
     columns = inverse.a * places[0] + inverse.b * places[1] + inverse.c
     rows = inverse.d * places[0] + inverse.e * places[1] + inverse.f
@@ -278,6 +290,7 @@ def _geojson_geometry(said: object) -> Any:
     import shapely
 
     try:
-        return shapely.from_geojson(json.dumps(said), on_invalid="ignore") if isinstance(said, dict) else None
+        with np.errstate(all="ignore"):  # a number too large becomes infinite, which no place is
+            return shapely.from_geojson(json.dumps(said), on_invalid="ignore") if isinstance(said, dict) else None
     except RecursionError:
         return None

@@ -23,6 +23,7 @@ Geometry = Any
 """A shapely geometry: the library has no types."""
 MOST_POINTS: Final = 100_000
 """Of one feature."""
+LEAST_M2: Final = 1e-4
 FAR_M: Final = 100_000.0
 """The tangent plane is none so far from its point."""
 _AREAS: Final = frozenset({"Polygon", "MultiPolygon"})
@@ -44,7 +45,7 @@ class Unread(Enum):
     FAR = "far"
     TOO_LARGE = "too_large"
     INVALID = "invalid"
-    """Nothing is left of an area that crosses itself."""
+    """An area that has none, or of which nothing is left where it crosses itself."""
     NO_AREA = "no_area"
     """A building, or land of one use, that is no area: often one that an extract cut."""
 
@@ -144,14 +145,16 @@ def _primitive(feature: Feature, plane: TangentPlane) -> Primitive | Unread:
     if (np.abs(shapely.get_coordinates(geometry)) > FAR_M).any():
         return Unread.FAR
     kind = kind_of(feature.tags)
-    if kind is Kind.BARRIER and geometry.geom_type in _AREAS:
+    if geometry.geom_type not in _AREAS:
+        if _needs_area(kind, feature.tags, geometry.geom_type):
+            return Unread.NO_AREA
+    elif kind is Kind.BARRIER:
         geometry = shapely.boundary(geometry)  # a fence around a garden does not fill it
-    if geometry.geom_type in _AREAS and not shapely.is_valid(geometry):
-        geometry = _areas_of(shapely.make_valid(geometry))
-        if shapely.is_empty(geometry):
+    else:
+        if not shapely.is_valid(geometry):
+            geometry = _areas_of(shapely.make_valid(geometry))
+        if shapely.area(geometry) < LEAST_M2:
             return Unread.INVALID
-    if geometry.geom_type not in _AREAS and _needs_area(kind, feature.tags, geometry.geom_type):
-        return Unread.NO_AREA
     height, assumed = height_m(kind, feature.tags)
     return Primitive(
         feature.feature_id, kind, feature.tags.get("name", ""), geometry, width_m(kind, feature.tags), height, assumed

@@ -1,5 +1,7 @@
 """Scenes that hear each other's patches: what changed, what is merged, and that all agree whatever the link did."""
 
+import struct
+import zlib
 from random import Random
 
 import numpy as np
@@ -239,6 +241,22 @@ def test_no_bytes_do_harm(junk: list[bytes], place: int, value: int) -> None:
         assert outcome in (Outcome.TAKEN, Outcome.CORRUPT)
         assert (outcome is Outcome.TAKEN) == (reader.versions() != {})
     assert sum(reader.counts.values()) == len(junk) + 1
+
+
+@given(st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 255)), max_size=6), st.binary(max_size=40))
+def test_no_lie_under_a_right_checksum_does_harm(changes: list[tuple[int, int]], more: bytes) -> None:
+    reader = Scene(GRID, "site")
+    patch = bytearray(encode(GRID, BlockKey("robot1", "live", 3), 5, np.full((16, 16), 50, np.int8))[:-4] + more)
+    for place, value in changes:
+        patch[place % len(patch)] = value
+    outcome = reader.apply(bytes(patch) + struct.pack("<I", zlib.crc32(patch)))
+    assert (outcome in (Outcome.TAKEN, Outcome.OWN)) == (reader.version > 0)
+    for layer in LAYERS:
+        merged = reader.merged(layer)
+        assert merged.min() >= -1 and merged.max() <= 100
+    reader.paint("live", square(0, 0, 5), 100)
+    reader.publish()
+    assert reader.merged("live")[0, 0] == 100, "what the liar says is not above what comes later"
 
 
 def test_misuse_is_refused() -> None:
