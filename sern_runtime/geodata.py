@@ -28,6 +28,7 @@ MOST_FILE_BYTES: Final = 64_000_000
 MOST_FEATURES: Final = 200_000
 MARGIN_PIXELS: Final = 2
 """Around a grid, for what lies between the middles of pixels."""
+_METRES: Final = frozenset({"m", "metre", "metres", "meter", "meters"})
 _DEGREES: Final = "EPSG:4326"
 _OSM_IDS: Final = {
     "points": (("node", "osm_id"),),
@@ -58,10 +59,11 @@ class MapFeatures:
 
 
 def read_elevation(path: Path, *, crs: str | None = None, near: Grid | None = None) -> "ElevationRaster":
-    """The first band of a raster that GDAL reads, in any reference system; of a large one only what lies `near` a grid.
+    """A raster of heights that GDAL reads, in any reference system; of a large one only what lies `near` a grid.
 
     `crs` is the reference system of a file that has none, such as EPSG:4326; it does not overrule one. Heights stay
-    above the zero that they have. ConfigError: not there, no raster, no reference system, too large, not near.
+    above the zero that they have. ConfigError: not there, no raster, no reference system, several bands, not in
+    metres, too large, not near.
     """
     _need("elevation", path, "rasterio", "pyproj", "scipy")
     import rasterio
@@ -78,6 +80,10 @@ def read_elevation(path: Path, *, crs: str | None = None, near: Grid | None = No
             with rasterio.open(path) as source:
                 if source.transform.is_identity or source.transform.is_degenerate:
                     raise ConfigError("does not say where its pixels are: give a georeferenced raster", file=file)
+                if source.count != 1:
+                    raise ConfigError(f"has {source.count} bands: give a raster of heights alone", file=file)
+                if (source.units[0] or "m").lower() not in _METRES:
+                    raise ConfigError(f"has heights in {source.units[0]}: turn them into metres", file=file)
                 system = _system(source.crs.to_wkt() if source.crs else crs, file)
                 window = Window(0, 0, source.width, source.height)
                 if near is not None:
@@ -88,7 +94,8 @@ def read_elevation(path: Path, *, crs: str | None = None, near: Grid | None = No
                         "cut it to the site, or make them larger",
                         file=file,
                     )
-                heights = source.read(1, window=window, masked=True).astype(np.float64).filled(np.nan)
+                stored = source.read(1, window=window, masked=True).astype(np.float64).filled(np.nan)
+                heights = stored * source.scales[0] + source.offsets[0]
                 transform = source.transform
     except rasterio.errors.RasterioError as error:
         raise ConfigError(f"is no raster that can be read: {_first_line(error)}", file=file) from error
@@ -111,9 +118,8 @@ def read_osm(path: Path) -> MapFeatures:
 
     ConfigError: not there, no extract, larger than `MOST_FILE_BYTES` or of more than `MOST_FEATURES`.
     """
-    _need("a map", path, "pyogrio", "shapely")
+    _need("a map", path, "pyogrio", "shapely", "scipy")
     import pyogrio
-    import pyogrio.errors
     import pyogrio.raw
 
     file = str(path)
@@ -135,7 +141,7 @@ def read_osm(path: Path) -> MapFeatures:
                     found.features.extend(_osm_features(layer, [str(name) for name in meta["fields"]], shapes, columns))
                 elif len(shapes):
                     found.count(layer, len(shapes))
-    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
+    except _errors() as error:
         raise ConfigError(f"is no map that can be read: {_first_line(error)}", file=file) from error
     found.warnings.extend(sorted({_first_line(warning.message) for warning in said}))
     return found
@@ -146,7 +152,7 @@ def read_geojson(data: bytes, file: str) -> MapFeatures:
 
     ConfigError names `file`: no GeoJSON, another reference system than WGS 84, too large as in `read_osm`.
     """
-    _need("a map", Path(file), "shapely")
+    _need("a map", Path(file), "shapely", "scipy")
     from sern_twin.world.primitives import Feature
 
     if len(data) > MOST_FILE_BYTES:
@@ -182,6 +188,13 @@ def read_geojson(data: bytes, file: str) -> MapFeatures:
         name = str(member.get("id", tags.get("@id", number)))
         found.features.append(Feature(name, tags, _geojson_geometry(member.get("geometry"))))
     return found
+
+
+def _errors() -> tuple[type[Exception], ...]:
+    """What pyogrio raises of a file; they have no base of their own."""
+    from pyogrio import errors
+
+    return errors.DataSourceError, errors.DataLayerError, errors.FeatureError, errors.FieldError, errors.GeometryError
 
 
 def _need(what: str, path: Path, *packages: str) -> None:

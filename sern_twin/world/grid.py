@@ -114,8 +114,9 @@ class Grid:
         Both are `NOWHERE` for what is not on the grid or not finite. The west and south edges belong to a cell.
         """
         places = np.asarray(points, np.float64)
-        across = (places[..., 0] - self.west_m) / self.cell_m
-        along = (places[..., 1] - self.south_m) / self.cell_m
+        with np.errstate(over="ignore"):  # infinite is outside, too
+            across = (places[..., 0] - self.west_m) / self.cell_m
+            along = (places[..., 1] - self.south_m) / self.cell_m
         inside = (across >= 0) & (across < self.columns) & (along >= 0) & (along < self.rows)
         columns = np.where(inside, across, NOWHERE).astype(np.int64)
         rows = np.where(inside, along, NOWHERE).astype(np.int64)

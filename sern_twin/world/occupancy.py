@@ -135,12 +135,15 @@ class Occupancy:
         What stands `low_m` to `high_m` above the ground is in the way. A cell where there is only ground, within
         `low_m` of it, is free. All else is counted. How many cells were seen. UsageError: another shape, no band.
         """
-        points = np.asarray(points_m)
+        points, ground = np.asarray(points_m, np.float64), np.asarray(ground_m, np.float64)
         if points.ndim != 2 or points.shape[1] < 3:
             raise UsageError(f"a cloud of {points.shape}: give a row of x, y, z for each point")
+        if ground.shape not in ((), (len(points),)):
+            raise UsageError(f"a ground of {ground.shape} below {len(points)} points: give one height, or one for each")
         if not 0 < low_m < high_m:
             raise UsageError(f"a band from {low_m} m to {high_m} m above the ground: 0 < low < high")
-        heights = points[:, 2].astype(np.float64) - np.broadcast_to(np.asarray(ground_m, np.float64), len(points))
+        with np.errstate(over="ignore", invalid="ignore"):
+            heights = points[:, 2] - ground
         cells = self.grid.flat(points[:, :2])
         finite = np.isfinite(points[:, :3]).all(axis=1) & np.isfinite(heights)
         below, above = finite & (heights < -low_m), finite & (heights > high_m)

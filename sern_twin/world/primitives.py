@@ -186,7 +186,9 @@ def _footprint(thing: Primitive, least_m: float) -> Geometry:
     if thing.geometry.geom_type in _AREAS:
         return thing.geometry
     if thing.geometry.geom_type in _LINES:
-        return shapely.buffer(thing.geometry, max(thing.width_m / 2, least_m), cap_style="flat")
+        # A line without length has no sides, only ends.
+        ends = "flat" if shapely.length(thing.geometry) > 0 else "round"
+        return shapely.buffer(thing.geometry, max(thing.width_m / 2, least_m), cap_style=ends)
     return shapely.buffer(thing.geometry, thing.width_m / 2)
 
 

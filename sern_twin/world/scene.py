@@ -195,7 +195,10 @@ class Scene:
         return tuple(key for key, version in self.versions().items() if version > theirs.get(key, 0))
 
     def forget(self, writer: str) -> None:
-        """Drop what another writer said: it has gone for good. UsageError: it is this scene's own."""
+        """Drop what another writer said: it has gone for good. Scenes that hold it still may bring it back.
+
+        UsageError: it is this scene's own.
+        """
         if writer == self.writer:
             raise UsageError(f"the scene is that of {writer}: set its cells to unknown instead")
         for layer in LAYERS:
@@ -308,10 +311,11 @@ def _inside(grid: Grid, corners: Floats) -> tuple[slice, slice, NDArray[np.bool_
     )
     easts = grid.centres(0, np.arange(columns.start, columns.stop))[:, 0]
     norths = grid.centres(np.arange(rows.start, rows.stop), 0)[:, 1]
-    inside = np.zeros((len(norths), len(easts)), np.bool_)
+    # How many sides cross each row of middles just before a column: the cells west of an odd number are inside.
+    crossings = np.zeros((len(norths), len(easts) + 1), np.int16)
     for (x, y), (next_x, next_y) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        crossed = (y <= norths) != (next_y <= norths)
-        if crossed.any():
-            cross = x + (norths[crossed] - y) / (next_y - y) * (next_x - x)
-            inside[crossed] ^= easts < cross[:, None]
-    return rows, columns, inside
+        crossed = np.flatnonzero((y <= norths) != (next_y <= norths))
+        cross = x + (norths[crossed] - y) / (next_y - y if len(crossed) else 1.0) * (next_x - x)
+        crossings[crossed, np.searchsorted(easts, cross)] += 1
+    east_of = crossings.sum(axis=1, keepdims=True) - np.cumsum(crossings, axis=1)[:, :-1]
+    return rows, columns, east_of % 2 == 1

@@ -133,10 +133,31 @@ def test_a_raster_that_is_none_is_refused(tmp_path: Path) -> None:
     large = slope(tmp_path / "large.tif", "EPSG:32632", 1.0, size=2001)
     with pytest.raises(ConfigError, match="2001 x 2001 pixels here, 4000000 are the most"):
         read_elevation(large)
+    for said, change in (("in ft: turn", {"units": ("ft",)}), ("2 bands", {})):
+        path = tmp_path / f"{len(change)}.tif"
+        with rasterio.open(
+            path, "w", driver="GTiff", width=4, height=4, count=2 - len(change), dtype="int16", crs="EPSG:4326",
+            transform=Affine(0.1, 0, 11, 0, -0.1, 47),
+        ) as target:  # fmt: skip
+            target.units = change.get("units", ("m", "m"))
+        with pytest.raises(ConfigError, match=said):
+            read_elevation(path)
     cut = slope(tmp_path / "cut.tif", "EPSG:32632", 1.0, size=600)
     cut.write_bytes(cut.read_bytes()[:9000])
     with pytest.raises(ConfigError, match=r"cut\.tif: is no raster that can be read"):
         read_elevation(cut)
+
+
+def test_stored_numbers_have_a_scale_and_an_offset(tmp_path: Path) -> None:
+    path = tmp_path / "dem.tif"
+    with rasterio.open(
+        path, "w", driver="GTiff", width=3, height=2, count=1, dtype="int16", crs="EPSG:4326", nodata=-1,
+        transform=Affine(0.001, 0, 11, 0, -0.001, 47),
+    ) as target:  # fmt: skip
+        target.write(np.array([[100, 200, 300], [-1, 500, 600]], np.int16), 1)
+        target.scales, target.offsets = (0.1,), (400.0,)
+    wanted = np.array([[410, 420, 430], [math.nan, 450, 460]])
+    np.testing.assert_allclose(read_elevation(path).heights_m, wanted)
 
 
 @needs_streets

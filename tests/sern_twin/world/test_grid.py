@@ -24,7 +24,7 @@ def test_the_middle_of_each_cell_is_in_it() -> None:
 
 
 def test_what_is_not_on_the_grid_is_nowhere() -> None:
-    outside = [[-2.01, 0], [8.5, 0], [0, -1.01], [0, 3.5], [math.nan, 0], [0, math.inf], [-1e300, 1e300]]
+    outside = [[-2.01, 0], [8.5, 0], [0, -1.01], [0, 3.5], [math.nan, 0], [0, math.inf], [-1e300, 1e300], [1e308, 0]]
     rows, columns = GRID.index(outside)
     assert (rows == NOWHERE).all() and (columns == NOWHERE).all()
     assert (GRID.flat(outside) == NOWHERE).all()

@@ -154,6 +154,9 @@ def test_the_ground_of_a_cloud_may_differ_and_be_unknown() -> None:
     assert world.cells()[16, [20, 24, 28]].tolist() == [70, 40, -1]
     assert world.ignored[Ignored.NAN] == 1
     assert world.fuse_points(np.empty((0, 3))) == 0
+    assert world.fuse_points([(0.1, 0.1, 1e308), (0.1, 0.1, math.inf)], ground_m=[-1e308, math.inf]) == 0
+    with pytest.raises(UsageError, match=r"a ground of \(2,\) below 3 points"):
+        world.fuse_points(points, ground_m=[1.0, 2.0])
     with pytest.raises(UsageError, match="a row of x, y, z"):
         world.fuse_points([[0.0, 0.0]])
     with pytest.raises(UsageError, match="0 < low < high"):

@@ -125,6 +125,13 @@ def test_what_is_smaller_than_a_cell_has_one_and_what_is_elsewhere_none() -> Non
     assert not rasterised([only(shapely.Point(degrees((90, 90))[0]), barrier="bollard")], GRID).any()
 
 
+def test_a_line_of_no_length_is_a_spot() -> None:
+    line = shapely.LineString(degrees((1.25, 1.25), (1.25, 1.25)))
+    layer = rasterised([only(line, barrier="wall"), only(line, highway="service")], GRID)
+    assert layer[42, 42] == Kind.BARRIER
+    assert np.count_nonzero(layer) == np.count_nonzero(layer[39:46, 39:46]) == 37, "a circle 3.5 m wide"
+
+
 def test_a_fence_around_a_garden_does_not_fill_it() -> None:
     garden = shapely.Polygon(degrees((-10, -10), (10, -10), (10, 10), (-10, 10)))
     layer = rasterised([only(garden, barrier="fence")], GRID)

@@ -88,6 +88,23 @@ def test_a_polygon_has_the_cells_whose_middles_it_holds() -> None:
     assert (scene.cells("twin_only") == 7).all()
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_a_polygon_may_cross_itself(seed: int) -> None:
+    """By the even-odd rule, which is written out here for each cell."""
+    random = Random(seed)
+    corners = [(random.uniform(-2, 12), random.uniform(-2, 9)) for _ in range(random.randint(3, 12))]
+    scene = Scene(GRID, "operator")
+    count = scene.paint("twin_only", corners, 100)
+    wanted = np.zeros(GRID.shape, np.bool_)
+    for row, column in np.ndindex(GRID.shape):
+        east, north = GRID.centres(row, column).tolist()
+        for (x, y), (to_x, to_y) in zip(corners, corners[1:] + corners[:1], strict=True):
+            if (y <= north) != (to_y <= north) and east < x + (north - y) / (to_y - y) * (to_x - x):
+                wanted[row, column] ^= True
+    assert ((scene.cells("twin_only") == 100) == wanted).all()
+    assert count == np.count_nonzero(wanted) > 0
+
+
 def test_the_newest_writer_is_believed_and_unknown_says_nothing() -> None:
     robot, other = Scene(GRID, "robot1"), Scene(GRID, "robot2")
     robot.paint("live", square(1, 1), 100)
