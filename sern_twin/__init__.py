@@ -1,6 +1,7 @@
 """The virtual twin: where things are, how fine they are kept, and what is known of a robot that is not heard. Pure.
 
 geodesy       from latitude and longitude to metres at the site, and from there to the axes of Unity
+world         the ground, the map and what robots see of a site, and the patches that say what changed
 detail        which blocks of the scene are kept at which level of detail
 motion        the state of a ground robot, and how it moves on
 slip          what a skid-steered robot makes of a command, learned while it is heard
