@@ -1,6 +1,7 @@
 """The metrics of a client: read at scrape from whoever counts."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from sern_client.bridge import Bridge
 from sern_client.checks import TableCheck
@@ -15,6 +16,9 @@ from sern_runtime.internal_errors import InternalErrors
 from sern_runtime.link_metrics import register_codecs, register_links, register_received
 from sern_runtime.metrics import Metrics
 
+if TYPE_CHECKING:
+    from sern_client.scene.node import SceneNode
+
 
 @dataclass(frozen=True, slots=True)
 class Counting:
@@ -28,6 +32,7 @@ class Counting:
     adaptation: Adaptation | None
     errors: InternalErrors
     collector: CollectorWatch
+    scene: "SceneNode | None" = None
 
 
 def register_client(metrics: Metrics, parts: Counting) -> None:
@@ -49,6 +54,8 @@ def _register_link(metrics: Metrics, parts: Counting) -> None:
     parts.errors.register(metrics)
     parts.collector.register(metrics)
     register_summaries(metrics, bridge.outbound.summaries)
+    if parts.scene is not None:
+        parts.scene.register(metrics)
     metrics.gauge(
         "sern_objects",
         "Cross-reality objects, of this client and of others.",

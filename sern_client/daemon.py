@@ -19,13 +19,14 @@ from sern_client.bridge import Bridge
 from sern_client.checks import TableCheck
 from sern_client.client_metrics import Counting, register_client
 from sern_client.connection import Connection
-from sern_client.endpoints.base import Endpoint, ObjectEndpoint, ServedEndpoint
+from sern_client.endpoints.base import BothTold, Endpoint, ObjectEndpoint, ServedEndpoint
 from sern_client.endpoints.composite import with_services
-from sern_client.factory import make_endpoint, make_link_topics
+from sern_client.factory import local_encoding, make_endpoint, make_link_topics
 from sern_client.guard import Guard
 from sern_client.link_news import SILENT, LinkNews
 from sern_client.link_state import LinkState
 from sern_client.objects_view import objects_view
+from sern_client.scene.making import make_scene
 from sern_client.services import ServiceBridge
 from sern_client.site import Site
 from sern_client.site_objects import CoreObjects
@@ -94,7 +95,7 @@ class ClientDaemon:
         self.errors = InternalErrors()
         self.collector = CollectorWatch()
         self.parts = OptionalParts(
-            "adaptation", "codecs", "frames", "http", "link_state", "message_log", "metrics", "summaries"
+            "adaptation", "codecs", "frames", "http", "link_state", "message_log", "metrics", "scene", "summaries"
         )
         self.message_log = MessageLog(loaded.resolve(model.message_log)) if model.message_log else None
         self.site = Site(
@@ -125,10 +126,12 @@ class ClientDaemon:
             withdraws=state.withdraw_after_s is not None,
         )
         self.core = self.bridge.core
+        objects = CoreObjects(self.core, self._kick)
         if isinstance(endpoint, ObjectEndpoint):
-            endpoint.use_objects(CoreObjects(self.core, self._kick))
+            endpoint.use_objects(objects)
+        self.scene = make_scene(loaded, endpoint, self.site, objects, local_encoding(model))
         self.core.subscribe(model.subscribe_patterns(), now=now)
-        self.core.subscribe_objects([section.selection() for section in model.objects], now=now)
+        self.core.subscribe_objects(model.object_selections(), now=now)
         self.adaptation = self._make_adaptation()
         self.news = LinkNews(self.core.link, model.relay.endpoint)
         self.link_state = LinkState(
@@ -140,7 +143,7 @@ class ClientDaemon:
             reason=self.why,
             parts=self.parts,
         )
-        self.check = TableCheck(Tables(self.bridge, self.link_state), now=now)
+        self.check = TableCheck(Tables(self.bridge, self.link_state, self.scene), now=now)
         self.connection = Connection(self.core, model.relay, model.link, on_down=self.link_down)
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
         self._http: HttpServer | None = None
@@ -218,7 +221,8 @@ class ClientDaemon:
                 self._http = self._make_http(model.http.listen)
                 await self._http.start()
         # Before the transport: streams from the relay are advertised at the endpoint as soon as there is a session.
-        await self.site.endpoint.start(self.bridge.outbound)
+        events = self.bridge.outbound if self.scene is None else BothTold(self.bridge.outbound, self.scene)
+        await self.site.endpoint.start(events)
         self._endpoint_started = True
         self.link_state.start()
         if self.guard is not None:
@@ -228,6 +232,9 @@ class ClientDaemon:
             self.connection.open(self._ctx, keys, server_keys)
         self.tasks.append(asyncio.create_task(self._tick(), name="client-tick"))
         self.tasks.append(asyncio.create_task(self._tell_objects(), name="client-objects"))
+        if self.scene is not None:
+            kept = self.parts.keep("scene", self.scene.run, reset=lambda: None)
+            self.tasks.append(asyncio.create_task(kept, name="scene"))
         if self.adaptation is not None:
             kept = self.parts.keep("adaptation", self.adaptation.run, reset=self.adaptation.reset)
             self.tasks.append(asyncio.create_task(kept, name="adaptation"))
@@ -327,6 +334,7 @@ class ClientDaemon:
             adaptation=adaptation,
             errors=self.errors,
             collector=self.collector,
+            scene=self.scene,
         )
         register_client(metrics, counting)
         metrics.counter(
@@ -346,6 +354,7 @@ class ClientDaemon:
                 "/api/topics": self.topics,
                 "/api/trace": trace_view(of_client(self.core.link, self.core.trace), clock.now),
                 "/api/values": self.site.values.view(),
+                **({} if self.scene is None else {"/api/scene": self.scene.to_json}),
                 **({} if adaptation is None else {"/api/mmcf": adaptation.to_json}),
                 **(self.site.endpoint.json_routes if isinstance(self.site.endpoint, ServedEndpoint) else {}),
             },
@@ -416,6 +425,8 @@ class ClientDaemon:
                 stack.push_async_callback(self.site.endpoint.stop)
             if self.guard is not None:
                 stack.push_async_callback(self.guard.stop)
+            if self.scene is not None:
+                stack.callback(self.scene.close)
             stack.callback(self.bridge.close)
             stack.callback(self.link_state.close)
             if self.bridge.services is not None:

@@ -16,6 +16,7 @@ from sern_core.vocabulary.types import Encoding
 from sern_runtime.config import endpoints as sections
 from sern_runtime.config.client import ClientFile
 from sern_runtime.config.load import Loaded
+from sern_runtime.config.twin import TwinEndpoint
 from sern_runtime.ros_files import installed_files
 
 _log = logging.getLogger(__name__)
@@ -98,13 +99,19 @@ def make_link_topics(model: ClientFile, advertise: Callable[[TopicInfo], Publish
     ros = [section for section in model.endpoints if isinstance(section, ROS_SECTIONS)]
     if not (ros if state.publish is None else state.publish):
         return None
+    return LinkTopics(model.name, local_encoding(model), advertise, diagnostics=state.diagnostics)
+
+
+def local_encoding(model: ClientFile) -> Encoding:
+    """The encoding of messages that this client makes for its site: that of the first endpoint that has one."""
+    ros = [section for section in model.endpoints if isinstance(section, ROS_SECTIONS)]
     first = ros[0] if ros else model.endpoints[0]
     cdr = not isinstance(first, sections.Ros1Endpoint)
     if isinstance(first, sections.RecordEndpoint):
         cdr = first.path.endswith(".mcap")
-    elif isinstance(first, sections.SyntheticEndpoint):
+    elif isinstance(first, sections.SyntheticEndpoint | TwinEndpoint):
         cdr = first.encoding == "cdr"
-    return LinkTopics(model.name, Encoding.CDR if cdr else Encoding.ROS1, advertise, diagnostics=state.diagnostics)
+    return Encoding.CDR if cdr else Encoding.ROS1
 
 
 def named_sections(model: ClientFile) -> list[sections.EndpointSection]:

@@ -1,16 +1,21 @@
 """The tables of bridge and endpoint, compared and mended: what should be open there, and what is."""
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from sern_client.bridge import Bridge
 from sern_client.endpoints.base import Difference, Held
 from sern_client.link_state import LinkState
 
+if TYPE_CHECKING:
+    from sern_client.scene.node import SceneNode
+
 
 class Tables:
-    """`link_state` has topics of its own at the endpoint."""
+    """`link_state` and `scene` have topics of their own at the endpoint."""
 
-    def __init__(self, bridge: Bridge, link_state: LinkState | None = None) -> None:
+    def __init__(self, bridge: Bridge, link_state: LinkState | None = None, scene: "SceneNode | None" = None) -> None:
+        self._scene = scene
         self._bridge = bridge
         self._link_state = link_state
 
@@ -22,7 +27,11 @@ class Tables:
         publishers = inbound.held
         if self._link_state is not None:
             publishers += self._link_state.held
-        return found + self._bridge.site.endpoint.validate(Held(publishers, outbound.held))
+        subscriptions = outbound.held
+        if self._scene is not None:
+            publishers += self._scene.held.publishers
+            subscriptions += self._scene.held.subscriptions
+        return found + self._bridge.site.endpoint.validate(Held(publishers, subscriptions))
 
     def repair(self, differences: Sequence[Difference]) -> None:
         """Open anew at the endpoint what is not open there as it should be."""

@@ -34,6 +34,22 @@ class TopicEvents(Protocol):
     def topic_removed(self, name: TopicName) -> None: ...
 
 
+class BothTold:
+    """`TopicEvents` of two who want to know; the second is told first when a topic goes."""
+
+    def __init__(self, first: TopicEvents, second: TopicEvents) -> None:
+        self._first = first
+        self._second = second
+
+    def topic_added(self, info: TopicInfo) -> None:
+        self._first.topic_added(info)
+        self._second.topic_added(info)
+
+    def topic_removed(self, name: TopicName) -> None:
+        self._second.topic_removed(name)
+        self._first.topic_removed(name)
+
+
 class Subscription(Protocol):
     def close(self) -> None: ...
 

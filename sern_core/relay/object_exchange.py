@@ -248,6 +248,9 @@ class ObjectExchange:
         feed.pump(now=now)
 
     def _sees(self, client: ClientName, object_id: str, kind: ObjectKind | None) -> bool:
+        about = self._registry.about(object_id)
+        if about is not None and about[1] == client:
+            return False  # its own
         wants = self._wants[client]
         self._links[client].reassembly.work_us += LOOK_US * len(wants)
         if not any((kind is None or want.kind in (None, kind)) and want.pattern.fullmatch(object_id) for want in wants):

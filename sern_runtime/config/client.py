@@ -56,6 +56,7 @@ from sern_runtime.config.base import (
 from sern_runtime.config.endpoints import EndpointSection, RclpyEndpoint
 from sern_runtime.config.link_state import LinkStateSection
 from sern_runtime.config.load import Loaded, load
+from sern_runtime.config.scene import SceneSection
 from sern_runtime.config.shared import (
     ClassWord,
     HttpSection,
@@ -458,9 +459,11 @@ class ClientFile(FileModel):
     """Rules for topics, first match wins. A topic without a rule: bulk, best effort, depth 1, lifespan 1 s."""
     subscribe: tuple[Pattern, ...] = ()
     """Regular expressions for the whole global names that this site wants, beside rules with direction `receive`."""
-    objects: Annotated[tuple[ObjectSelection, ...], Field(max_length=MAX_WANTS)] = ()
+    objects: Annotated[tuple[ObjectSelection, ...], Field(max_length=MAX_WANTS - 1)] = ()
     """Cross-reality objects that this site wants, as far as the relay's access rules let it have them: robots,
     obstacles, patches, nodes, and topics with their latest values. It has them under /api/site_objects."""
+    scene: SceneSection | None = None
+    """The scene that this site shares with others; null: none."""
     services: ServicesSection = ServicesSection()
     """Services offered to other sites and used from them."""
     actions: ActionsSection = ActionsSection()
@@ -551,12 +554,21 @@ class ClientFile(FileModel):
         services = subscriptions(self.name, self.namespace, offer=self.offered_services(), use=self.used_services())
         return tuple(dict.fromkeys((*self.subscribe, *received, *services, *self.actions.patterns())))
 
+    def object_selections(self) -> tuple[Selection, ...]:
+        """What to ask the relay for of objects: `objects`, and the patches of the scene."""
+        selections = tuple(section.selection() for section in self.objects)
+        if self.scene is None:
+            return selections
+        return (*selections, Selection(ObjectKind.PATCH, f"/scene/{self.scene.name}/.*"))
+
     def placed(self, base_dir: Path) -> Self:
         relay = self.relay.model_copy(update={"endpoint": place(base_dir, self.relay.endpoint)})
         return self.model_copy(update={"relay": relay})
 
     def file_problems(self, base_dir: Path) -> Iterator[FileProblem]:
         yield from socket_problems(base_dir, self.relay.endpoint, ("relay", "endpoint"))
+        if self.scene is not None:
+            yield from self.scene.file_problems(base_dir, ("scene",))
         if self.relay.server_key_file is not None:
             loc = ("relay", "server_key_file")
             yield from public_key_problems(base_dir, self.relay.server_key_file, loc, client=self.name)

@@ -194,6 +194,20 @@ class Scene:
         """The blocks that this scene holds and another with these `versions` lacks, or has an older version of."""
         return tuple(key for key, version in self.versions().items() if version > theirs.get(key, 0))
 
+    def withdraw(self, key: BlockKey) -> bool:
+        """Another writer has taken a block back: its cells are unknown, and a newer patch of it still counts.
+
+        False: nothing is known of it. UsageError: it is this scene's own.
+        """
+        if key.writer == self.writer:
+            raise UsageError(f"the scene is that of {key.writer}: set its cells to unknown instead")
+        plane = self._planes.get((key.writer, key.layer))
+        if plane is None or not plane.versions[key.block]:
+            return False
+        plane.cells[self.grid.block_slices(key.block)] = UNKNOWN
+        self._merge(key.layer, key.block)
+        return True
+
     def forget(self, writer: str) -> None:
         """Drop what another writer said: it has gone for good. Scenes that hold it still may bring it back.
 

@@ -49,7 +49,8 @@ def metrics(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
         directory = tmp_path_factory.mktemp("metrics")
         async with Lab(directory, "robot1", "site", "twin") as lab:
             relay = lab.process(lab.relay_file())
-            site = lab.process(lab.recorder_file("site", "/robot1/.*"))
+            scene = {"name": "yard", "west_m": 0, "south_m": 0, "width_m": 1, "length_m": 1}
+            site = lab.process(lab.recorder_file("site", "/robot1/.*", scene=scene))
             bag = write_bag(directory / "a.bag", {"/text": 20})
             twins = {"kind": "twin", "robots": [{"name": "robot1", "pose": "/robot1/odom"}]}
             twin = lab.process(lab.client_file("twin", twins, client={"namespace": "/"}))

@@ -309,7 +309,7 @@ def test_a_package_that_is_there_is_found() -> None:
 
 def test_patterns_and_commands_of_a_relay(deployed: Path) -> None:
     path = deployed / "relay.yaml"
-    path.write_text(path.read_text().replace("publish: ['/{self}/.*']", "publish: ['{self}/.*']"))
+    path.write_text(path.read_text().replace("publish: ['/{self}/.*', ", "publish: ['{self}/.*', "))
     code, _, err = ran(path)
     assert code == 0
     assert "publish.0: '{self}/.*' matches no topic: names begin with '/'" in err

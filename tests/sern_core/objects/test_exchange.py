@@ -174,7 +174,8 @@ def test_a_client_that_was_forgotten_and_comes_back_in_the_same_process_tells_an
     world.run(10.0)
     put(robot, "robot/box", b"2")
     world.run(2.0)
-    assert values(site) == {"robot/box": b"2", "site/door": b"v"}
+    assert values(site) == {"robot/box": b"2"}
+    assert {item.id for item in world.relay.hub.objects.select()} == {"robot/box", "site/door"}
     checked(world)
 
 

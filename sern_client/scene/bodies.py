@@ -1,0 +1,138 @@
+"""Messages about a scene: scans and markers in, occupancy grids and their updates out."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from sern_client.endpoints.twin.bodies import ODOMETRY
+from sern_core.vocabulary.errors import BodyError, ConfigError
+from sern_core.vocabulary.types import Encoding
+from sern_runtime import ros_types
+from sern_twin.world.grid import Floats, Grid
+from sern_twin.world.patches import Cells
+
+SCAN: Final = "sensor_msgs/msg/LaserScan"
+MARKER: Final = "visualization_msgs/msg/Marker"
+GRID: Final = "nav_msgs/msg/OccupancyGrid"
+UPDATE: Final = "map_msgs/msg/OccupancyGridUpdate"
+MOST_SCAN_BYTES: Final = 512 * 1024
+CORNERS: Final = 16
+"""Of a cylinder's outline."""
+_CUBE, _SPHERE, _CYLINDER = 1, 2, 3
+_ADD, _DELETE, _DELETE_ALL = 0, 2, 3
+__all__ = ["GRID", "MARKER", "ODOMETRY", "SCAN", "UPDATE", "Marker", "Scan", "Writer", "read_marker", "read_scan"]
+
+
+class Scan(NamedTuple):
+    """Angles [rad] and ranges [m], (n,), at a stamp of the robot's clock."""
+
+    stamp_ns: int
+    angles_rad: Floats
+    ranges_m: Floats
+    least_m: float
+    most_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Marker:
+    """An obstacle that somebody adds (`outline` [m], (n, 2)), or deletes; `key` None: deletes all."""
+
+    key: tuple[str, int] | None
+    frame_id: str
+    outline: Floats | None
+    middle_m: tuple[float, float] = (0.0, 0.0)
+
+
+def read_scan(body: bytes, encoding: Encoding) -> Scan:
+    """A sensor_msgs/LaserScan. BodyError: it is none, or too large."""
+    if len(body) > MOST_SCAN_BYTES:
+        raise BodyError(f"a scan of {len(body)} bytes: {MOST_SCAN_BYTES} at most")
+    message = _read(body, SCAN, encoding)
+    ranges = np.asarray(message.ranges, np.float64)
+    angles = message.angle_min + message.angle_increment * np.arange(len(ranges))
+    if not 0 <= message.range_min < message.range_max < math.inf:
+        raise BodyError(f"a scan of ranges from {message.range_min} to {message.range_max} m")
+    return Scan(_stamp_ns(message.header.stamp), angles, ranges, message.range_min, message.range_max)
+
+
+def read_marker(body: bytes, encoding: Encoding) -> Marker:
+    """A visualization_msgs/Marker that is a cube, sphere or cylinder. BodyError: it is none."""
+    message = _read(body, MARKER, encoding)
+    if message.action == _DELETE_ALL:
+        return Marker(None, message.header.frame_id, None)
+    key = (str(message.ns), int(message.id))
+    if message.action == _DELETE:
+        return Marker(key, message.header.frame_id, None)
+    if message.action != _ADD or message.type not in (_CUBE, _SPHERE, _CYLINDER):
+        raise BodyError(f"a marker of type {message.type} and action {message.action}: add cubes, spheres, cylinders")
+    place, turn, size = message.pose.position, message.pose.orientation, message.scale
+    numbers = (place.x, place.y, turn.x, turn.y, turn.z, turn.w, size.x, size.y)
+    if not (all(map(math.isfinite, numbers)) and size.x > 0 and size.y > 0):
+        raise BodyError("a marker whose place or size is not finite, or is nothing")
+    yaw_rad = math.atan2(2 * (turn.w * turn.z + turn.x * turn.y), 1 - 2 * (turn.y**2 + turn.z**2))
+    if message.type == _CUBE:
+        unit = np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])
+    else:
+        around = np.linspace(0.0, 2 * math.pi, CORNERS, endpoint=False)
+        unit = 0.5 * np.stack((np.cos(around), np.sin(around)), axis=1)
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    outline = unit * (size.x, size.y) @ np.array([(cos, sin), (-sin, cos)]) + (place.x, place.y)
+    return Marker(key, message.header.frame_id, outline, (place.x, place.y))
+
+
+class Writer:
+    def __init__(self, grid: Grid, encoding: Encoding) -> None:
+        self._grid = grid
+        self._encoding = encoding
+        self._seq = 0
+
+    def whole(self, cells: Cells, *, stamp_ns: int) -> bytes:
+        """A nav_msgs/OccupancyGrid of all cells."""
+        grid, encoding = self._grid, self._encoding
+        point = ros_types.new("geometry_msgs/msg/Point", encoding, x=grid.west_m, y=grid.south_m)
+        turn = ros_types.new("geometry_msgs/msg/Quaternion", encoding, w=1.0)
+        info = ros_types.new(
+            "nav_msgs/msg/MapMetaData",
+            encoding,
+            map_load_time=ros_types.time_of(stamp_ns, encoding),
+            resolution=grid.cell_m,
+            width=grid.columns,
+            height=grid.rows,
+            origin=ros_types.new("geometry_msgs/msg/Pose", encoding, position=point, orientation=turn),
+        )
+        header = self._header(stamp_ns)
+        message = ros_types.new(GRID, encoding, header=header, info=info, data=cells.reshape(-1))
+        return ros_types.serialise(message, GRID, encoding)
+
+    def update(self, cells: Cells, block: int, *, stamp_ns: int) -> bytes:
+        """A map_msgs/OccupancyGridUpdate of one block of all cells."""
+        rows, columns = self._grid.block_slices(block)
+        part = np.ascontiguousarray(cells[rows, columns])
+        message = ros_types.new(
+            UPDATE,
+            self._encoding,
+            header=self._header(stamp_ns),
+            x=columns.start,
+            y=rows.start,
+            width=part.shape[1],
+            height=part.shape[0],
+            data=part.reshape(-1),
+        )
+        return ros_types.serialise(message, UPDATE, self._encoding)
+
+    def _header(self, stamp_ns: int) -> Any:
+        self._seq = (self._seq + 1) & 0xFFFFFFFF
+        return ros_types.header(stamp_ns, self._grid.frame_id, self._encoding, self._seq)
+
+
+def _read(body: bytes, type_name: str, encoding: Encoding) -> Any:
+    try:
+        return ros_types.deserialise(body, type_name, encoding)
+    except ConfigError as error:
+        raise BodyError(str(error)) from error
+
+
+def _stamp_ns(stamp: Any) -> int:
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)

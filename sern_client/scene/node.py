@@ -1,0 +1,319 @@
+"""The scene of a site: its own scans and obstacles go into it and to all others as objects, theirs come in, and all of
+it together is a map on a topic of this site.
+
+Each block of each layer is an object `/scene/NAME/LAYER/BLOCK@CLIENT` of kind patch, whose value is the whole block as
+it is now (`sern_twin.world.patches`): whoever missed one is right with the next, and after a blackout only blocks that
+have changed are told. The map is nav_msgs/OccupancyGrid, latched, and what changes in it map_msgs/OccupancyGridUpdate:
+the static layer of a costmap takes both.
+"""
+
+import asyncio
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+from typing import Final
+
+from sern_client.endpoints.base import Held, Publisher, Sink, SiteObjects, Subscription
+from sern_client.endpoints.common.saying import SayOnce
+from sern_client.scene import bodies
+from sern_client.scene.hearing import Obstacles, Placed, Scanner, Unused
+from sern_client.scene.options import SceneOptions
+from sern_core.objects.xr_object import XrObject
+from sern_core.vocabulary.errors import BodyError, ConfigError, RefusedError, UsageError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.names import plain_type
+from sern_core.vocabulary.types import Encoding, ObjectKind, TopicName
+from sern_runtime import clock, ros_types
+from sern_runtime.metrics import Metrics
+from sern_twin.world.grid import Grid
+from sern_twin.world.occupancy import Occupancy
+from sern_twin.world.offset import object_offset
+from sern_twin.world.patches import LAYERS, OCCUPIED, UNKNOWN, BlockKey, Cells, Refusal, read_header
+from sern_twin.world.scene import Scene
+
+PERIOD_S: Final = 0.1
+WHOLE_S: Final = 5.0
+"""How often the whole map is published at most: to who comes late, the last one is latched."""
+MOST_UPDATES: Final = 64
+"""Of more blocks that change at once the whole map is published."""
+OFFSETS_S: Final = 1.0
+OFFSET_RADIUS_M: Final = 0.5
+"""How far from where it was added an obstacle is looked for in what is seen."""
+PATCH_TYPE: Final = "sern/ScenePatch"
+MOST_OBJECTS: Final = 4_000
+"""Blocks of one site's layers: a client may have 4,096 objects."""
+
+_log = logging.getLogger(__name__)
+
+
+class SceneNode:
+    """`subscribe` and `advertise` are the endpoint's, `encoding` is that of the map. `wall_ns`: a new process begins
+    its versions there."""
+
+    def __init__(
+        self,
+        options: SceneOptions,
+        grid: Grid,
+        client: str,
+        *,
+        base: Cells | None,
+        encoding: Encoding,
+        subscribe: Callable[[TopicName, Sink], Subscription],
+        advertise: Callable[[TopicInfo], Publisher],
+        objects: SiteObjects,
+        now: Callable[[], float] = clock.now,
+        wall_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self.options = options
+        self.grid = grid
+        self.scene = Scene(grid, client, first_version=wall_ns() // 1_000_000)
+        self.occupancy = Occupancy(grid)
+        self.unused: Counter[Unused] = Counter()
+        self.offsets_m: dict[str, float] = {}
+        """How far what is seen of an obstacle is from where it was added, by its marker."""
+        self._client = client
+        self._subscribe = subscribe
+        self._advertise = advertise
+        self._objects = objects
+        self._now = now
+        self._wall_ns = wall_ns
+        self._prefix = f"/scene/{options.name}/"
+        self._scanners = [Scanner(each, grid, self.unused) for each in options.scanners]
+        self.obstacles = Obstacles(grid, self.unused)
+        self._writer = bodies.Writer(grid, encoding)
+        self._encoding = encoding
+        self._subscriptions: dict[TopicName, list[Subscription]] = {}
+        self._publishers: dict[TopicName, Publisher] = {}
+        self._changed: set[int] = set(range(grid.blocks)) if base is not None else set()
+        self._whole_due_s = now()
+        self._whole = True
+        self._offsets_due_s = now()
+        self._said = SayOnce(_log)
+        if base is not None:
+            self.scene.set_cells("base", base)
+        objects.listen(self)
+
+    # --- topics of the site -------------------------------------------------------------------------------------------
+
+    def topic_added(self, info: TopicInfo) -> None:
+        if info.name in self._subscriptions:
+            return
+        found: list[Subscription] = []
+        wanted = [(scanner.options.scan, bodies.SCAN, scanner.scan) for scanner in self._scanners]
+        wanted += [(scanner.options.pose, bodies.ODOMETRY, scanner.pose) for scanner in self._scanners]
+        if self.options.obstacles is not None:
+            wanted.append((self.options.obstacles, bodies.MARKER, self.obstacles.heard))
+        for name, type_name, hear in wanted:
+            if name != info.name:
+                continue
+            if plain_type(info.type_name) != plain_type(type_name) or info.encoding is Encoding.RAW:
+                self._said(f"scene: {name} is {info.type_name}, and {type_name} is read; it is left out", name)
+                continue
+            found.append(self._subscribe(info.name, partial(self._heard, info, hear)))
+        if found:
+            self._subscriptions[info.name] = found
+
+    def topic_removed(self, name: TopicName) -> None:
+        for subscription in self._subscriptions.pop(name, ()):
+            subscription.close()
+
+    def _heard(self, info: TopicInfo, hear: Callable[[bytes, Encoding], None], body: bytes, stamp_ns: int) -> bool:
+        try:
+            hear(body, info.encoding)
+        except BodyError as error:
+            self.unused[Unused.UNREADABLE] += 1
+            self._said(f"scene: {info.name}: {error}", str(info.name))
+        return True
+
+    @property
+    def held(self) -> Held:
+        return Held(
+            Counter(self._publishers.keys()),
+            Counter({name: len(held) for name, held in self._subscriptions.items()}),
+        )
+
+    def close(self) -> None:
+        for name in list(self._subscriptions):
+            self.topic_removed(name)
+        for publisher in self._publishers.values():
+            publisher.close()
+        self._publishers.clear()
+
+    # --- objects of others --------------------------------------------------------------------------------------------
+
+    def changed(self, item: XrObject) -> None:
+        if item.kind is not ObjectKind.PATCH or item.value is None or not item.id.startswith(self._prefix):
+            return
+        header = read_header(self.grid, item.value)
+        if not isinstance(header, Refusal) and header.key.writer != item.owner:
+            self._said(
+                f"scene: {item.owner} sends patches in the name of {header.key.writer}; none is taken", item.owner
+            )
+            return
+        outcome = self.scene.apply(item.value)
+        if isinstance(header, Refusal):
+            self._said(f"scene: a patch of {item.owner} is not for this grid ({outcome.value})", item.owner, outcome)
+        else:
+            self._changed.add(header.key.block)
+
+    def deleted(self, object_id: str) -> None:
+        key = self._key(object_id)
+        if key is not None and key.writer != self._client and self.scene.withdraw(key):
+            self._changed.add(key.block)
+
+    def _id(self, key: BlockKey) -> str:
+        return f"{self._prefix}{key.layer}/{key.block}@{key.writer}"
+
+    def _key(self, object_id: str) -> BlockKey | None:
+        place, _, writer = object_id.removeprefix(self._prefix).rpartition("@")
+        layer, _, number = place.partition("/")
+        if not object_id.startswith(self._prefix) or layer not in LAYERS or not number.isdecimal():
+            return None
+        return BlockKey(writer, layer, int(number)) if int(number) < self.grid.blocks else None
+
+    # --- in time ------------------------------------------------------------------------------------------------------
+
+    async def run(self) -> None:
+        while True:
+            await asyncio.sleep(PERIOD_S)
+            placed = self.take()
+            if placed:  # takes milliseconds: not where poses and commands wait
+                await asyncio.to_thread(self.fuse, placed)
+            self.tick(seen=bool(placed))
+
+    def take(self) -> list[Placed]:
+        """What scanners have seen since the last call."""
+        return [placed for scanner in self._scanners if (placed := scanner.take()) is not None]
+
+    def fuse(self, placed: list[Placed]) -> None:
+        """Have scans change the occupancy. Nobody else touches that meanwhile."""
+        for pose, scan in ((each.pose, each.scan) for each in placed):
+            self.occupancy.fuse(pose, scan.angles_rad, scan.ranges_m, scan.most_m, range_min_m=scan.least_m)
+
+    def tick(self, *, seen: bool) -> None:
+        """Tell the others what has changed here, and this site what has changed anywhere."""
+        if seen:
+            self.scene.set_cells("live", self.occupancy.classes())
+        if self.obstacles.changed:
+            self.obstacles.changed = False
+            self._paint()
+        for key in self.scene.publish():
+            self._changed.add(key.block)
+            try:
+                self._objects.put(self._id(key), ObjectKind.PATCH, PATCH_TYPE, value=self.scene.encode_block(key))
+            except (RefusedError, UsageError) as error:
+                self._said(f"scene: {error}", type(error).__name__)
+        now = self._now()
+        self._publish(now)
+        if now >= self._offsets_due_s:
+            self._offsets_due_s = now + OFFSETS_S
+            self._measure()
+
+    def _paint(self) -> None:
+        cells = self.scene.cells("twin_only")
+        cells[:] = UNKNOWN
+        self.scene.set_cells("twin_only", cells)
+        for marker in self.obstacles.markers.values():
+            if marker.outline is not None:
+                self.scene.paint("twin_only", marker.outline, OCCUPIED)
+
+    def cells(self) -> Cells:
+        """All layers together: what is added over what is seen over what the map says."""
+        found = self.scene.merged("base")
+        for layer in LAYERS[1:]:
+            over = self.scene.merged(layer)
+            known = over != UNKNOWN
+            found[known] = over[known]
+        return found
+
+    def _publish(self, now: float) -> None:
+        if self.options.publish is None:
+            self._changed.clear()
+            return
+        if not self._changed and not (self._whole and now >= self._whole_due_s):
+            return
+        cells, stamp_ns = self.cells(), self._wall_ns()
+        due = self._whole and now >= self._whole_due_s
+        if due or len(self._changed) > MOST_UPDATES:
+            self._whole, self._whole_due_s = False, now + WHOLE_S
+            self._say(self.options.publish, bodies.GRID, self._writer.whole(cells, stamp_ns=stamp_ns), stamp_ns)
+        else:
+            self._whole = True
+            for block in sorted(self._changed):
+                update = self._writer.update(cells, block, stamp_ns=stamp_ns)
+                self._say(f"{self.options.publish}_updates", bodies.UPDATE, update, stamp_ns)
+        self._changed.clear()
+
+    def _say(self, topic: str, type_name: str, body: bytes, stamp_ns: int) -> None:
+        name = TopicName(topic)
+        publisher = self._publishers.get(name)
+        if publisher is None:
+            info = ros_types.topic_info(topic, type_name, self._encoding, latched=type_name == bodies.GRID)
+            try:
+                publisher = self._publishers[name] = self._advertise(info)
+            except ConfigError as error:
+                self._said(f"scene: {error}", topic)
+                return
+        publisher.publish(body, stamp_ns)
+
+    def _measure(self) -> None:
+        """How far what robots see of each obstacle is from where it was added."""
+        self.offsets_m.clear()
+        if not self.obstacles.markers:
+            return
+        added = (self.grid, self.scene.cells("twin_only"))
+        seen = (self.grid, self.scene.merged("live"))
+        base = self.scene.merged("base")
+        for (namespace, number), marker in self.obstacles.markers.items():
+            offset = object_offset(added, seen, marker.middle_m, OFFSET_RADIUS_M, before=(None, base))
+            if offset is not None:
+                self.offsets_m[f"{namespace}/{number}"] = offset.distance_m
+
+    # --- what is told of it -------------------------------------------------------------------------------------------
+
+    def to_json(self) -> dict[str, object]:
+        """What `/api/scene` says."""
+        cells = self.cells()
+        return {
+            "name": self.options.name,
+            "grid_id": self.grid.grid_id,
+            "columns": self.grid.columns,
+            "rows": self.grid.rows,
+            "cell_m": self.grid.cell_m,
+            "occupied_cells": int((cells >= OCCUPIED).sum()),
+            "known_cells": int((cells != UNKNOWN).sum()),
+            "blocks": len(self.scene.versions()),
+            "digests": {layer: self.scene.digest(layer) for layer in LAYERS},
+            "patches": {outcome.value: count for outcome, count in self.scene.counts.items()},
+            "unused": dict(self.unused),
+            "ignored_readings": {reason.value: count for reason, count in self.occupancy.ignored.items()},
+            "obstacles": len(self.obstacles.markers),
+            "offsets_m": dict(self.offsets_m),
+        }
+
+    def register(self, metrics: Metrics) -> None:
+        metrics.counter(
+            "sern_scene_patches_total",
+            "Patches of others that came, by outcome.",
+            ("outcome",),
+            lambda: [((outcome.value,), float(count)) for outcome, count in self.scene.counts.items()],
+        )
+        metrics.counter(
+            "sern_scene_unused_total",
+            "Poses, scans and obstacles of this site that are not in the scene, by reason.",
+            ("reason",),
+            lambda: [((str(reason),), float(count)) for reason, count in self.unused.items()],
+        )
+        metrics.gauge(
+            "sern_scene_blocks",
+            "Blocks of the scene that something is known of, of all layers and writers.",
+            read=lambda: [((), float(len(self.scene.versions())))],
+        )
+        metrics.gauge(
+            "sern_scene_offset_metres",
+            "How far what is seen of an obstacle is from where it was added here.",
+            ("obstacle",),
+            lambda: [((name,), offset_m) for name, offset_m in self.offsets_m.items()],
+        )

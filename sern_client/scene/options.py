@@ -1,0 +1,21 @@
+"""What a scene is told by its file; `sern_runtime/config/scene.py` says what each means."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class ScannerOptions:
+    scan: str
+    pose: str
+    x_m: float = 0.0
+    y_m: float = 0.0
+    yaw_rad: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class SceneOptions:
+    name: str
+    scanners: tuple[ScannerOptions, ...] = ()
+    obstacles: str | None = None
+    publish: str | None = "/scene/map"
+    """None: there is nowhere to publish it."""

@@ -1,0 +1,101 @@
+"""The section `scene`: the map that sites share, and what goes into it here."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Final
+
+from pydantic import Field, model_validator
+
+from sern_runtime.config.base import ClientText, FileProblem, PathText, Section, TopicText, fault, resolve
+from sern_runtime.config.yaml import Loc
+
+MOST_BLOCKS: Final = 1_300
+"""Three layers of them are as many objects as a client may have."""
+
+
+class ScannerSection(Section):
+    """A planar scanner of this site, and the robot that carries it."""
+
+    scan: TopicText
+    """Its topic (local name): sensor_msgs/LaserScan."""
+    pose: TopicText
+    """Where its robot is, in the frame of the grid (local name): nav_msgs/Odometry."""
+    x_m: Annotated[float, Field(ge=-100, le=100)] = 0.0
+    """Where it is on its robot: ahead of where the pose is."""
+    y_m: Annotated[float, Field(ge=-100, le=100)] = 0.0
+    """To the left of it."""
+    yaw_rad: Annotated[float, Field(ge=-math.tau, le=math.tau)] = 0.0
+    """Which way it looks."""
+
+
+class OriginSection(Section):
+    """A place on the Earth, as sensor_msgs/NavSatFix has it."""
+
+    latitude_deg: Annotated[float, Field(gt=-90, lt=90)]
+    """To the north."""
+    longitude_deg: Annotated[float, Field(ge=-180, le=180)]
+    """To the east."""
+    height_m: Annotated[float, Field(ge=-1000, le=10_000)] = 0.0
+    """Above the ellipsoid, or whatever the elevation model has its heights above."""
+
+
+class SceneSection(Section):
+    """The scene that sites share: what their scanners see and what people add, as one map at each site. All sites of a
+    scene need the same name and grid."""
+
+    name: ClientText
+    """Its name; its patches are the objects /scene/NAME/..., which access rules name so."""
+    west_m: Annotated[float, Field(ge=-1e6, le=1e6)]
+    """Where the grid begins, in its frame."""
+    south_m: Annotated[float, Field(ge=-1e6, le=1e6)]
+    """Where the grid begins, in its frame."""
+    width_m: Annotated[float, Field(gt=0, le=10_000)]
+    """How far it goes to the east."""
+    length_m: Annotated[float, Field(gt=0, le=10_000)]
+    """How far it goes to the north."""
+    cell_m: Annotated[float, Field(gt=0, le=100)] = 0.1
+    """The side of a cell."""
+    block_cells: Annotated[int, Field(ge=4, le=48)] = 16
+    """Cells along the side of a block: what is sent where one of them changes."""
+    frame_id: str = "map"
+    """The frame of the grid; poses and obstacles are in it as well."""
+    origin: OriginSection | None = None
+    """Where the origin of the frame is on the Earth; needed for `base`."""
+    scanners: Annotated[tuple[ScannerSection, ...], Field(max_length=16)] = ()
+    """What sees the scene here."""
+    obstacles: TopicText | None = None
+    """Topic of this site (local name) by which people add obstacles to the scene: visualization_msgs/Marker, cubes,
+    spheres and cylinders, as rviz and scripts publish them; a marker that is deleted is taken back."""
+    base: PathText | None = None
+    """A map of the site that is the ground of the scene: .osm, .osm.pbf or .geojson. Buildings, barriers and water are
+    occupied, roads and paths free. One site is enough."""
+    publish: TopicText = "/scene/map"
+    """Where the map is published here: nav_msgs/OccupancyGrid, and what changes beside it under NAME_updates."""
+
+    @property
+    def columns(self) -> int:
+        return math.ceil(self.width_m / self.cell_m - 1e-9)
+
+    @property
+    def rows(self) -> int:
+        return math.ceil(self.length_m / self.cell_m - 1e-9)
+
+    @model_validator(mode="after")
+    def _fits(self) -> "SceneSection":
+        blocks = math.ceil(self.columns / self.block_cells) * math.ceil(self.rows / self.block_cells)
+        if blocks > MOST_BLOCKS:
+            raise fault(
+                f"a grid of {self.columns} x {self.rows} cells has {blocks} blocks, and {MOST_BLOCKS} are the most; "
+                "take larger cells, or more block_cells",
+                "cell_m",
+            )
+        if self.base is not None and self.origin is None:
+            raise fault("is needed for base: where the frame's origin is on the Earth", "origin")
+        return self
+
+    def file_problems(self, base_dir: Path, loc: Loc) -> Iterator[FileProblem]:
+        if self.base is not None:
+            path = resolve(base_dir, self.base)
+            if not path.is_file():
+                yield FileProblem((*loc, "base"), f"{path}: no such file")

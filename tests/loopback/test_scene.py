@@ -1,0 +1,65 @@
+"""A scene that a robot and a site share, as daemons: what one sees or adds is on the map of the other."""
+
+from pathlib import Path
+
+import pytest
+
+from sern_client.daemon import ClientDaemon
+from sern_client.scene.node import SceneNode
+from sern_core.vocabulary.types import Encoding
+from sern_twin.world.patches import OCCUPIED
+from tests.daemons import Json, Lab
+from tests.sern_client.scene.test_scene_node import marker
+from tests.support import until
+
+SCENE: Json = {
+    "name": "yard", "west_m": -12, "south_m": -12, "width_m": 24, "length_m": 24, "cell_m": 0.1, "frame_id": "odom"
+}  # fmt: skip
+ROBOT: Json = {
+    "kind": "synthetic", "role": "robot", "topics": ["/odometry/filtered", "/scan"], "follow": True, "encoding": "cdr"
+}  # fmt: skip
+
+
+def node_of(daemon: ClientDaemon) -> SceneNode:
+    assert daemon.scene is not None
+    return daemon.scene
+
+
+async def test_a_robot_and_a_site_share_a_scene(tmp_path: Path) -> None:
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        await lab.relay()
+        seeing = {"scanners": [{"scan": "/scan", "pose": "/odometry/filtered"}]}
+        robot = await lab.connected(
+            lab.client_file("robot1", ROBOT, scene={**SCENE, **seeing}, discovery={"mode": "manual"})
+        )
+        site = await lab.connected(lab.recorder_file("site", "/nothing", scene=SCENE))
+        here, there = node_of(robot), node_of(site)
+        await until(lambda: int((there.scene.merged("live") == OCCUPIED).sum()) > 200, "the site has what is seen")
+        there.obstacles.heard(marker(x_m=0.0, y_m=3.9), Encoding.CDR)
+        row, column = (int(value) for value in here.grid.index([0.0, 3.9]))
+        await until(lambda: here.cells()[row, column] == OCCUPIED, "the robot has what was added")
+        there.obstacles.heard(marker(action=3), Encoding.CDR)
+        await until(lambda: here.cells()[row, column] != OCCUPIED, "and that it is gone")
+        await until(lambda: here.scene.digest("live") == there.scene.digest("live"), "both have the same")
+        assert here.unused.keys() <= {"superseded", "no_pose"}
+        await until(lambda: not robot.check.found, "nothing differs at the endpoint")
+
+
+@pytest.mark.parametrize(
+    ("scene", "problem"),
+    [
+        (
+            {**SCENE, "cell_m": 0.01},
+            "scene.cell_m: a grid of 2400 x 2400 cells has 22500 blocks, and 1300 are",
+        ),
+        ({**SCENE, "base": "streets.osm"}, "scene.origin: is needed for base"),
+        ({**SCENE, "origin": {"latitude_deg": 1, "longitude_deg": 2}, "base": "none.osm"}, "none.osm: no such file"),
+        ({**SCENE, "name": "A yard"}, "scene.name: "),
+        ({**SCENE, "scanners": [{"scan": "/scan"}]}, "scene.scanners.0.pose: "),
+    ],
+)
+async def test_a_wrong_scene_is_one_line(tmp_path: Path, scene: Json, problem: str) -> None:
+    async with Lab(tmp_path, "robot1") as lab:
+        process = lab.process(lab.client_file("robot1", ROBOT, scene=scene))
+        assert await process.ended() == 2
+        await process.said(problem)
