@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from sern_core.objects.changes import Begin, Define, Delete, End, Put
+from sern_core.objects.changes import Begin, Define, Delete, End, Put, set_of
 from sern_core.objects.changes import encode as encode_change
 from sern_core.vocabulary.errors import RemoteError
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo, TopicSpec
@@ -434,6 +434,7 @@ def valid() -> list[Vector]:
                 ("define", "the text of a definition", Define(definition_hash(DEFINITION), DEFINITION)),
                 ("put", "an object with its value", _object(b"value", upto=None)),
                 ("put-large", "an object whose value is too large", _object(None, upto=12)),
+                ("set", "another value of an object", set_of(_object(b"other", upto=12))),
                 ("delete", "it is gone", Delete("zones/hall", 13)),
                 ("end", "all is told up to a version", End(14)),
             )

@@ -14,6 +14,7 @@ from typing import Final
 
 from benchmarks.common import Report, main
 from benchmarks.sync import cases
+from benchmarks.sync.patches import patches
 
 DATA: Final = Path(__file__).resolve().parents[3] / "shared" / "data"
 
@@ -26,8 +27,9 @@ def bench(options: argparse.Namespace, report: Report) -> None:
     cases.recorded(options.data, report)
     cases.bound(200 if options.quick else 10_000, report)
     cases.reckoning(max(1, seeds // 4), report)
+    patches(max(1, seeds // 10), report)
     cases.cost(report)
-    report.note(f"{seeds} seeds; stops and dead reckoning a quarter of them")
+    report.note(f"{seeds} seeds; stops and dead reckoning a quarter of them, patches a tenth")
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

@@ -69,6 +69,7 @@ class DataPlane:
         if lane.copies and (copy := lane.due_copy(now)) is not None:
             self._sender.scheduler.charge(PriorityClass.CONTROL, len(copy), now=now)
             lanes.wire_bytes += len(copy) + OVERHEAD_BYTES
+            lane.copy_rest.sent(copy=True)
             lane.priority = PriorityClass.CONTROL
             return copy
         lane.priority = PriorityClass.STATE
@@ -147,9 +148,11 @@ class DataPlane:
         redundant = lane.redundant
         if redundant or lane is lanes.priority_lane:
             lane.spare = not waits or scheduler.within_share(now)
+            lane.copy_rest.sent(copy=False)
             if (
                 redundant
                 and lane.spare
+                and lane.copy_rest.may(now, queues=estimator.queues)
                 and any(type(item) is SentData and _urgent(item.channel) for item in draft.items)
             ):
                 lane.copies.append((now + COPY_DELAY_S, flight.next_number - 1, datagram))

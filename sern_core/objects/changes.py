@@ -57,6 +57,19 @@ class Put(NamedTuple):
     upto: int | None = None
 
 
+class Set(NamedTuple):
+    """An object that the reader has from the same feed, with another value: the rest of it is as it was."""
+
+    object_id: str
+    value: bytes | None
+    value_bytes: int
+    value_sha256: str
+    seq: int
+    ros_stamp_ns: int | None
+    wall_ns: int
+    upto: int | None = None
+
+
 class Delete(NamedTuple):
     object_id: str
     upto: int | None = None
@@ -68,7 +81,7 @@ class End(NamedTuple):
     upto: int
 
 
-Change = Begin | Define | Put | Delete | End
+Change = Begin | Define | Put | Set | Delete | End
 
 
 def object_stream(origin: ClientName, boot: int) -> StreamInfo:
@@ -108,6 +121,20 @@ def put_of(item: XrObject, text: str, *, upto: int | None = None) -> Put:
     )
 
 
+def set_of(put: Put) -> Set:
+    """What is new of it, to a reader that has the rest."""
+    return Set(
+        put.object_id,
+        put.value,
+        put.value_bytes,
+        put.value_sha256,
+        put.seq,
+        put.ros_stamp_ns,
+        put.wall_ns,
+        put.upto,
+    )
+
+
 def encode(change: Change) -> bytes:
     """Raises UsageError for an object whose texts do not fit into one envelope."""
     envelope: framing.Envelope
@@ -122,27 +149,23 @@ def encode(change: Change) -> bytes:
         envelope = {"op": "delete", "id": change.object_id}
     else:
         attachment = change.value or b""
-        envelope = {
-            "op": "put",
-            "id": change.object_id,
-            "kind": str(change.kind),
-            "owner": change.owner,
-            "type": change.type_name,
-            "attr": change.attributes,
-            "n": change.value_bytes,
-            "seq": change.seq,
-            "wall": change.wall_ns,
-        }
-        for key, text in (("hash", change.definition_hash), ("dh", change.text_hash)):
-            if text:
-                envelope[key] = text
+        envelope = {"op": "set", "id": change.object_id}
+        if isinstance(change, Put):
+            envelope["op"] = "put"
+            texts = (change.kind, change.owner, change.type_name, change.definition_hash, change.text_hash)
+            for key, text in zip(("kind", "owner", "type", "hash", "dh"), texts, strict=True):
+                if text:
+                    envelope[key] = str(text)
+            if change.attributes:
+                envelope["attr"] = change.attributes
+        envelope |= {"n": change.value_bytes, "seq": change.seq, "wall": change.wall_ns}
         if change.value is None and change.value_sha256:
             envelope["sha"] = change.value_sha256
         if change.value is not None:
             envelope["val"] = True
         if change.ros_stamp_ns is not None:
             envelope["stamp"] = change.ros_stamp_ns
-    if isinstance(change, (Put, Delete)) and change.upto is not None:
+    if isinstance(change, (Put, Set, Delete)) and change.upto is not None:
         envelope["upto"] = change.upto
     if framing.envelope_bytes(envelope) > framing.MAX_ENVELOPE_BYTES:
         raise UsageError(
@@ -173,17 +196,29 @@ def decode(body: bytes) -> Change:
     upto = framing.take_int(envelope, "upto") if "upto" in envelope else None
     if operation == "delete":
         return Delete(object_id, upto)
-    if operation != "put":
+    if operation not in ("put", "set"):
         raise WireError(f"unknown change of an object {operation!r}")
-    kind = framing.take_str(envelope, "kind", max_length=16)
-    if kind not in _KINDS:
-        raise WireError(f"object {object_id!r} has the unknown kind {kind!r}")
     told = framing.take_bool(envelope, "val")
     if attachment and not told:
         raise WireError(f"object {object_id!r} has a value that is none")
     value_bytes = framing.take_int(envelope, "n", low=-1)
     if told and value_bytes != len(attachment):
         raise WireError(f"object {object_id!r} has a value of {len(attachment)} bytes, which is to have {value_bytes}")
+    fresh = Set(
+        object_id,
+        attachment if told else None,
+        value_bytes,
+        framing.take_str(envelope, "sha", max_length=64, default=""),
+        framing.take_int(envelope, "seq", default=0),
+        framing.take_int(envelope, "stamp", low=-(2**63)) if "stamp" in envelope else None,
+        framing.take_int(envelope, "wall", low=-(2**63), default=0),
+        upto,
+    )
+    if operation == "set":
+        return fresh
+    kind = framing.take_str(envelope, "kind", max_length=16)
+    if kind not in _KINDS:
+        raise WireError(f"object {object_id!r} has the unknown kind {kind!r}")
     return Put(
         object_id,
         framing.take_str(envelope, "owner", max_length=64, default=""),
@@ -192,12 +227,12 @@ def decode(body: bytes) -> Change:
         framing.take_str(envelope, "hash", max_length=MAX_HASH_CHARS, default=""),
         framing.take_str(envelope, "dh", max_length=DEFINITION_HASH_CHARS, default=""),
         framing.take_texts(envelope, "attr"),
-        attachment if told else None,
-        value_bytes,
-        framing.take_str(envelope, "sha", max_length=64, default=""),
-        framing.take_int(envelope, "seq", default=0),
-        framing.take_int(envelope, "stamp", low=-(2**63)) if "stamp" in envelope else None,
-        framing.take_int(envelope, "wall", low=-(2**63), default=0),
+        fresh.value,
+        fresh.value_bytes,
+        fresh.value_sha256,
+        fresh.seq,
+        fresh.ros_stamp_ns,
+        fresh.wall_ns,
         upto,
     )
 

@@ -18,6 +18,7 @@ from sern_core.objects.changes import (
     encode,
     object_stream,
     put_of,
+    set_of,
     text_hash,
 )
 from sern_core.objects.registry import ObjectRegistry
@@ -26,13 +27,19 @@ from sern_core.vocabulary.message import Message
 from sern_core.vocabulary.types import ObjectKind
 
 PERIOD_S: Final = 0.1
-"""How often a reader is told of one object at most: the paper's 10 Hz of patches."""
-LEAST_WINDOW_BYTES: Final = 4096
-MOST_WINDOW_BYTES: Final = 256 * 2**10
-"""What may be on its way to the reader. It is doubled while it is read in `QUICK_S`, and halved when that takes
-`SLOW_S`: what waits any longer has grown old."""
-QUICK_S: Final = 0.25
-SLOW_S: Final = 1.0
+"""How often a feed is to be looked at."""
+REST_S: Final = 0.05
+"""How long after a look at what has changed comes the next one at least. Two feeds in a row, client's and relay's, are
+to carry what changes ten times a second (the paper's patches) each time."""
+BURST_S: Final = 0.01
+"""What changes so soon after a look is of the same event, and goes with it."""
+LEAST_AHEAD_BYTES: Final = 2048
+MOST_AHEAD_BYTES: Final = 64 * 2**10
+"""What may wait for the link. It is doubled when all of it has gone by the time that more is due, and halved when
+something of it waits for `OLD_S`: what waits there grows old, what waits in the registry is told as it is then."""
+OLD_S: Final = 0.15
+MOST_UNREAD_BYTES: Final = 256 * 2**10
+"""What the reader may not have confirmed."""
 LOOKS: Final = 256
 """Objects that are looked at in one turn."""
 OVERHEAD_BYTES: Final = 40
@@ -66,16 +73,15 @@ class ObjectFeed:
         self.idle = False
         """Nobody is to be told anything."""
         self._pending: dict[str, None] = {}
-        self._told: dict[str, int] = {}  # version of each object that the reader has from us
+        self._told: dict[str, tuple[int, int]] = {}  # of each object that the reader has: version, hash of its texts
         self._texts: set[str] = set()  # hashes of the texts that it has
         self._version = 0  # up to which `_pending` is what has changed
         self._began = False
         self._open = False  # a batch that was begun and is not ended
         self._unsure = False  # the reader has objects from an earlier feed
-        self._poll_due_s = now
-        self._window_bytes = LEAST_WINDOW_BYTES
-        self._mark: tuple[int, float] | None = None  # seq and time of what the window is measured by
-        self._full = False  # the window was, since then
+        self._looked_s = now - REST_S
+        self._ahead_bytes = LEAST_AHEAD_BYTES
+        self._full = False  # what may wait did, since it was looked at last
         self.restart()
 
     def restart(self, version: int = 0, epoch: int | None = None) -> None:
@@ -99,12 +105,19 @@ class ObjectFeed:
         `PERIOD_S`."""
         if self.idle or not self._link.established or self.channel.wanted is False:
             return
-        self._measure(now)
-        if self._mark is not None and now - self._mark[1] > SLOW_S:
-            return  # the link stands still: what changes until it goes on is told once
+        channel = self.channel
+        if not channel.queue:
+            if self._full:
+                self._ahead_bytes = min(2 * self._ahead_bytes, MOST_AHEAD_BYTES)
+            self._full = False
+        elif now - channel.queue[0].message.born_s > OLD_S:
+            if self._full:
+                self._ahead_bytes = max(self._ahead_bytes // 2, LEAST_AHEAD_BYTES)
+            self._full = False
+            return
         self._poll(now)
         looks = LOOKS
-        while looks and self._waiting_bytes() < self._window_bytes:
+        while looks and self._room():
             looks -= 1
             if not self._began:
                 self._began = True
@@ -118,7 +131,7 @@ class ObjectFeed:
                 self._say(End(self._version), now)
             else:
                 return
-        if self._waiting_bytes() >= self._window_bytes:
+        if not self._room():
             self._full = True
 
     @property
@@ -127,9 +140,12 @@ class ObjectFeed:
         return not (self._pending or self._open or self.channel.retained) and self._version == self._registry.version
 
     def _poll(self, now: float) -> None:
-        if self._pending or self._open or now < self._poll_due_s or self._version == self._registry.version:
+        if self._pending or self._open or self._version == self._registry.version:
             return
-        self._poll_due_s = now + PERIOD_S
+        if now >= self._looked_s + REST_S:
+            self._looked_s = now
+        elif now > self._looked_s + BURST_S:
+            return
         changes = self._registry.changed(self._version, kinds=self.kinds)
         if changes.resync:
             self.restart()
@@ -147,37 +163,30 @@ class ObjectFeed:
                 self._open = bool(self._pending)
             return
         item = self._registry.get(object_id)
-        if item is None or self._told.get(object_id) == item.version:
+        known_version, known_texts = self._told.get(object_id, (0, 0))
+        if item is None or known_version == item.version:
             return
         text = self._text_of(item)
         named = text_hash(text)
         if text and named not in self._texts:
             self._texts.add(named)
             self._say(Define(named, text), now)
-        self._told[object_id] = item.version
-        self._say(put_of(item, text, upto=upto), now)
+        put = put_of(item, text, upto=upto)
+        texts = hash((put[:6], tuple(put.attributes.items())))
+        self._told[object_id] = item.version, texts
+        self._say(set_of(put) if known_version and known_texts == texts else put, now)
         self._open = bool(self._pending)
 
     def _say(self, change: Change, now: float) -> None:
         channel = self.channel
-        seq = channel.next_seq
-        if self._mark is None:
-            self._mark = (seq, now)
-        message = Message(channel.stream.id, seq, encode(change), 0, now)
+        message = Message(channel.stream.id, channel.next_seq, encode(change), 0, now)
         self._link.sender.submit(channel, message, now=now, forced=True)
 
-    def _waiting_bytes(self) -> int:
-        return self.channel.retained_bytes + OVERHEAD_BYTES * len(self.channel.retained)
-
-    def _measure(self, now: float) -> None:
-        if self._mark is None or self.channel.watermark < self._mark[0]:
-            return
-        took_s = now - self._mark[1]
-        if took_s < QUICK_S and self._full:
-            self._window_bytes = min(2 * self._window_bytes, MOST_WINDOW_BYTES)
-        elif took_s > SLOW_S:
-            self._window_bytes = max(self._window_bytes // 2, LEAST_WINDOW_BYTES)
-        self._mark, self._full = None, False
+    def _room(self) -> bool:
+        channel = self.channel
+        ahead_bytes = channel.queued_bytes + OVERHEAD_BYTES * len(channel.queue)
+        unread_bytes = channel.retained_bytes + OVERHEAD_BYTES * len(channel.retained)
+        return ahead_bytes < self._ahead_bytes and unread_bytes < MOST_UNREAD_BYTES
 
     def validate(self) -> None:
         """Internal consistency, for tests."""

@@ -74,6 +74,11 @@ class CapacityEstimator(ABC):
         return self.rate_bps
 
     @property
+    def queues(self) -> bool:
+        """Whether what is sent waits on the path for longer than it is to: more than must be sent now is too much."""
+        return False
+
+    @property
     @abstractmethod
     def rtprop_s(self) -> float | None:
         """Round-trip time of the empty path; None while unknown."""

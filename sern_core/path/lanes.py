@@ -8,6 +8,7 @@ from sern_core.path.capacity import CapacityEstimator, Pacer
 from sern_core.path.congestion.fixed import FixedWindow
 from sern_core.path.congestion.hybrid import HybridWindow
 from sern_core.path.congestion.params import DEFAULT_HYBRID
+from sern_core.path.copies import CopyRest
 from sern_core.path.flight import Arrivals, Flight
 from sern_core.vocabulary.params import LinkParams, Redundancy, WindowAlgorithm
 from sern_core.vocabulary.types import PriorityClass
@@ -106,6 +107,7 @@ class Lane:
         """Both since the lane was opened."""
         self.copies: deque[tuple[float, int, bytes]] = deque()
         """Second copies to send: when, of which packet, the datagram."""
+        self.copy_rest = CopyRest()
         self._copied_packets = 0  # so many more will have copies
         self.copies_wanted: bool | None = None
         """What the adaptation says of them, where the configuration leaves it open (`auto`); None: the loss decides."""
@@ -216,6 +218,7 @@ class Lane:
         self.ping = False
         self.ping_due_s = now
         self.copies.clear()
+        self.copy_rest.restart()
         self.flight = Flight(lossless=self.lossless)
         self.arrivals = Arrivals(lossless=self.lossless)
         self.acknowledged_bytes = 0

@@ -11,7 +11,19 @@ from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple
 
 from sern_core.link.link import Link
-from sern_core.objects.changes import MAX_WANTS, OBJECTS_TOPIC, Begin, Define, Delete, End, Put, decode
+from sern_core.objects.changes import (
+    MAX_WANTS,
+    OBJECTS_TOPIC,
+    Begin,
+    Change,
+    Define,
+    Delete,
+    Put,
+    Set,
+    decode,
+    put_of,
+    text_hash,
+)
 from sern_core.objects.feed import ObjectFeed
 from sern_core.objects.registry import ObjectRegistry
 from sern_core.objects.xr_object import XrObject
@@ -122,7 +134,7 @@ class ObjectExchange:
         object_id = ""
         try:
             change = decode(message.body)
-            if isinstance(change, (Put, Delete)):
+            if isinstance(change, (Put, Set, Delete)):
                 object_id = change.object_id
             self._apply(self._owners.setdefault(client, _Owner()), client, change, now)
         except (RefusedError, WireError) as error:
@@ -134,9 +146,7 @@ class ObjectExchange:
             self.counts["taken"] += 1
         self.pump(now=now)
 
-    def _apply(
-        self, owner: _Owner, client: ClientName, change: Begin | Define | Put | Delete | End, now: float
-    ) -> None:
+    def _apply(self, owner: _Owner, client: ClientName, change: Change, now: float) -> None:
         registry = self._registry
         if isinstance(change, Begin):
             owner.begin(whole=change.whole)
@@ -145,11 +155,11 @@ class ObjectExchange:
                 raise RefusedError("too_large", f"{client} has sent {MAX_TEXTS_BYTES} bytes of definitions: too many")
             owner.texts_bytes += len(change.text)
             owner.texts[change.text_hash] = change.text
-        elif isinstance(change, Put):
+        elif isinstance(change, (Put, Set)):
             if owner.fresh is not None:
                 owner.fresh.add(change.object_id)  # also where it is refused: what there is of it stays
             try:
-                self._put(owner, client, change, now)
+                self._put(owner, client, self._whole(client, change), now)
             finally:
                 self._ended(owner, client, change.upto)
         elif isinstance(change, Delete):
@@ -162,6 +172,16 @@ class ObjectExchange:
         else:
             self._ended(owner, client, change.upto)
 
+    def _whole(self, client: ClientName, change: Put | Set) -> Put:
+        """A put, of a change of a value alone with the rest as it was."""
+        if isinstance(change, Put):
+            return change
+        item = self._registry.get(change.object_id)
+        if item is None or item.owner != client:
+            raise RefusedError("bad_object", f"{client} has no object {change.object_id[:80]} to give another value")
+        put = put_of(item, item.definition)
+        return put._replace(**{field: getattr(change, field) for field in Set._fields})
+
     def _put(self, owner: _Owner, client: ClientName, change: Put, now: float) -> None:
         check_right(self._access(), client, change.object_id)
         about = self._registry.about(change.object_id)
@@ -172,7 +192,7 @@ class ObjectExchange:
             owner=client,
             kind=change.kind,
             type_name=change.type_name,
-            definition=owner.texts.get(change.text_hash, ""),
+            definition=owner.texts.get(change.text_hash, "") or self._known_text(change),
             definition_hash=change.definition_hash,
             attributes=change.attributes,
             value=change.value,
@@ -181,6 +201,11 @@ class ObjectExchange:
             wall_ns=change.wall_ns,
             now=now,
         )
+
+    def _known_text(self, change: Put) -> str:
+        """The text of a definition that the object has already."""
+        item = self._registry.get(change.object_id) if change.text_hash else None
+        return item.definition if item is not None and text_hash(item.definition) == change.text_hash else ""
 
     def _ended(self, owner: _Owner, client: ClientName, upto: int | None) -> None:
         """A client has told all it has: what it had before is gone."""

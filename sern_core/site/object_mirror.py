@@ -10,7 +10,7 @@ from functools import partial
 from typing import Final, NamedTuple, Protocol
 
 from sern_core.link.control_stream import ControlStream
-from sern_core.objects.changes import MAX_WANTS, Begin, Define, Delete, End, Put, decode
+from sern_core.objects.changes import MAX_WANTS, Begin, Define, Delete, End, Put, Set, decode, put_of
 from sern_core.objects.xr_object import XrObject
 from sern_core.topics.patterns import compile_pattern
 from sern_core.vocabulary.errors import UsageError, WireError
@@ -105,13 +105,23 @@ class ObjectMirror:
             else:
                 self.counts["full"] += 1
         elif isinstance(change, Put):
-            self._put(change, now)
+            self._put(change, self._texts.get(change.text_hash, ""), now)
+        elif isinstance(change, Set):
+            self._set(change, now)
         elif isinstance(change, Delete):
             self._delete(change.object_id)
-        if isinstance(change, (Put, Delete, End)) and change.upto is not None:
+        if isinstance(change, (Put, Set, Delete, End)) and change.upto is not None:
             self._ended(change.upto)
 
-    def _put(self, change: Put, now: float) -> None:
+    def _set(self, change: Set, now: float) -> None:
+        old = self.objects.get(change.object_id)
+        if old is None:
+            self.counts["full"] += 1  # there was no room for it when it was put
+            return
+        put = put_of(old, old.definition)
+        self._put(put._replace(**{field: getattr(change, field) for field in Set._fields}), old.definition, now)
+
+    def _put(self, change: Put, definition: str, now: float) -> None:
         old = self.objects.get(change.object_id)
         if self._fresh is not None:
             self._fresh.add(change.object_id)
@@ -120,7 +130,7 @@ class ObjectMirror:
             owner=ClientName(change.owner),
             kind=change.kind,
             type_name=change.type_name,
-            definition=self._texts.get(change.text_hash, ""),
+            definition=definition,
             definition_hash=change.definition_hash,
             attributes=change.attributes,
             value=change.value,

@@ -25,6 +25,8 @@ MOST_BEAMS: Final = 100_000
 MOST_M: Final = 1e7
 MOST_RANGE_M: Final = 1e5
 MOST_RAD: Final = 1e6
+UNSURE_CELLS: Final = 1.5
+"""How far before its end a ray clears cells no more."""
 
 
 class Ignored(Enum):
@@ -50,19 +52,20 @@ class Ignored(Enum):
 
 @dataclass(frozen=True, slots=True)
 class OccupancyOptions:
-    """The probabilities are OctoMap's.
+    """Clamps and hits are OctoMap's. A cell becomes occupied after three scans, and free after some 26 that pass:
+    between the two lies what flickers at the edges of things, and each flicker would cross the link.
 
     UsageError: not 0 < least < miss < .5 < hit < most < 1, or not least < free < occupied < most.
     """
 
     hit: float = 0.7
     """How likely a cell is occupied in which a ray ends."""
-    miss: float = 0.4
+    miss: float = 0.45
     least: float = 0.12
     most: float = 0.97
-    free: float = 0.25
-    occupied: float = 0.65
-    """A cell becomes free, or occupied, at these; between it stays what it was. Those of ROS's map server."""
+    free: float = 0.15
+    occupied: float = 0.9
+    """A cell becomes free, or occupied, at these; between it stays what it was."""
 
     def __post_init__(self) -> None:
         if not 0 < self.least < self.miss < 0.5 < self.hit < self.most < 1:
@@ -118,10 +121,12 @@ class Occupancy:
             return 0
         used = self._usable(angles, ranges, range_min_m, range_max_m)
         angles, ranges = yaw_rad + angles[used], ranges[used]
-        lengths = np.minimum(ranges, range_max_m)[:, None]
         origin = np.array([x_m, y_m])
-        ends = origin + lengths * np.stack((np.cos(angles), np.sin(angles)), axis=1)
-        free = crossed(self.grid, origin, ends)
+        directions = np.stack((np.cos(angles), np.sin(angles)), axis=1)
+        ends = origin + np.minimum(ranges, range_max_m)[:, None] * directions
+        # Just before its end a ray says nothing: what stands there is not so sharp, and nor is where the scanner is.
+        sure_m = np.where(np.isfinite(ranges), np.maximum(ranges - UNSURE_CELLS * self.grid.cell_m, 0.0), range_max_m)
+        free = crossed(self.grid, origin, origin + sure_m[:, None] * directions)
         ended = self.grid.flat(ends[np.isfinite(ranges)])
         occupied = np.zeros(self.grid.shape, np.bool_)
         occupied.reshape(-1)[ended[ended != NOWHERE]] = True

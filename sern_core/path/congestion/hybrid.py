@@ -122,6 +122,10 @@ class HybridWindow(CapacityEstimator):
         return 8 * self._pace.value if self._pace.value is not None else None
 
     @property
+    def queues(self) -> bool:
+        return self._view.queue_s > self._view.high_s
+
+    @property
     def eased_s(self) -> float:
         return self._path.eased.at_s
 
