@@ -42,8 +42,9 @@ from sern_sim.world import Floats
 
 FINE_STEP_S: Final = 0.002
 FINE_STEPS: Final = round(STEP_S / FINE_STEP_S)
-YAW_SCALE: Final = 0.37
-"""What the base makes of a turn on level ground: one over the effective track ratio, measured at 0.7 m/s."""
+YAW_SCALE: Final = 0.34
+"""What the base makes of a turn on level ground: one over the effective track ratio, which is 2.5 to 3.2 by speed and
+turn. The friction of the wheels gives it; that about the upright axis is the scrubbing of a broad tyre."""
 MAX_AZIMUTHS: Final = 900
 """Above this many azimuths a cloud repeats neighbouring rays with fresh noise."""
 RANGE_NOISE_M: Final = 0.01
@@ -54,6 +55,8 @@ _CAMERA_M: Final = (0.2, 0.0, 0.3)
 _MOST_PIXELS: Final = 4096  # of rays a picture; a larger one repeats them
 _WHEELS: Final = ("fl", "fr", "rl", "rr")
 _CONTACT, _MESH, _BLOCKS, _ROBOT = range(4)  # groups of geoms; rays look at the middle two
+KV: Final = 30.0
+"""Of a wheel's motor, N·m for each rad/s that it is off: stiff, so that it stands on a slope."""
 _BASE_Z_M: Final = 0.13
 _XML: Final = """
 <mujoco model="jackal">
@@ -64,7 +67,7 @@ _XML: Final = """
     <body name="base" pos="0 0 {z}">
       <freejoint/>
       <inertial pos="0 0 0.12" mass="14" diaginertia="0.25 0.35 0.45"/>
-      <geom type="box" size="0.21 0.155 0.08" pos="0 0 0.16" group="3" user="5" friction="0.3"/>
+      <geom type="box" size="0.25 0.155 0.08" pos="0 0 0.16" group="3" user="5" friction="0.3"/>
       {wheels}
     </body>
   </worldbody>
@@ -75,7 +78,7 @@ _WHEEL: Final = """
       <body name="{name}" pos="{x} {y} {radius}">
         <joint name="{name}" type="hinge" axis="0 1 0" damping="0.05" armature="0.02"/>
         <geom type="cylinder" size="{radius} 0.02" zaxis="0 1 0" mass="0.5" group="3" user="5"
-              condim="6" friction="0.9 0.02 0.001" priority="1"/>
+              condim="6" friction="0.9 0.1 0.001" priority="1"/>
       </body>"""
 
 
@@ -226,7 +229,9 @@ class MujocoJackal:
         warnings = self._mujoco.mjtWarning
         for kind in (warnings.mjWARN_BADQPOS, warnings.mjWARN_BADQVEL, warnings.mjWARN_BADQACC):
             if self._data.warning[int(kind)].number:
-                raise ArithmeticError(f"the simulated robot became unstable {self._steps * STEP_S:.2f} s after its start")
+                raise ArithmeticError(
+                    f"the simulated robot became unstable {self._steps * STEP_S:.2f} s after its start"
+                )
 
     def _turned(self) -> Floats:
         """(3, 3): what turns the body's axes into those of the world."""
@@ -305,7 +310,7 @@ def _model(mujoco: Any, world: Terrain) -> Any:
             _WHEELS, ((x, y) for x in (0.131, -0.131) for y in (TRACK_M / 2, -TRACK_M / 2)), strict=True
         )
     ]
-    motors = [f'<velocity joint="{name}" kv="8" forcerange="-12 12"/>' for name in _WHEELS]
+    motors = [f'<velocity joint="{name}" kv="{KV:g}" forcerange="-12 12"/>' for name in _WHEELS]
     text = _XML.format(step=FINE_STEP_S, z=_BASE_Z_M, wheels="".join(wheels), motors="".join(motors))
     spec = mujoco.MjSpec.from_string(text)
     _ground(mujoco, spec, world)
@@ -368,5 +373,7 @@ def _stands(mujoco: Any, spec: Any, block: Block) -> None:
         pos=[block.x_m, block.y_m, block.z_m],
         quat=turned,
         group=_BLOCKS,
+        friction=[0.9 if block.label in (Label.BRIDGE, Label.LOG) else 0.2, 0.02, 0.001],
+        priority=2,  # above that of the wheels, which would climb a wall with what they have on the ground
         userdata=[block.label],
     )

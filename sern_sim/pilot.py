@@ -10,8 +10,9 @@ from collections.abc import Callable
 from random import Random
 from typing import Final, NamedTuple
 
-from sern_sim.follower import Follower, Reference
-from sern_sim.robot import STEP_S, Pose2, SimulatedJackal
+from sern_sim.follower import Follower, FollowerOptions, Reference
+from sern_sim.plant import Plant
+from sern_sim.robot import STEP_S, Pose2
 
 TAU: Final = 2 * math.pi
 OFF_M: Final = 0.01
@@ -23,8 +24,6 @@ NOISE_SHARE: Final = 0.3
 """What a pose trembles, as a share of that."""
 NOISE_MPS: Final = 0.01
 NOISE_RADPS: Final = 0.01
-YAW_SCALE: Final = 0.45
-"""What the robot's maker thinks that its base makes of a turn. The plant's is between 0.35 and 0.55."""
 
 
 class Found(NamedTuple):
@@ -42,16 +41,17 @@ class Pilot:
     def __init__(
         self,
         random: Random,
-        robot: SimulatedJackal,
+        robot: Plant,
         reference: Callable[[float], Reference],
         *,
         off_m: float = OFF_M,
+        follower: FollowerOptions | None = None,
     ) -> None:
         self._random = random
         self._robot = robot
         self._reference = reference
         self._off_m = off_m
-        self._follower = Follower(YAW_SCALE)
+        self._follower = Follower(robot.yaw_scale_known, follower)
         self._off = [random.gauss(0.0, sigma) for sigma in self._sigmas()]
         self.held = False
         """Somebody else commands the robot."""

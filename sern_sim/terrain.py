@@ -83,6 +83,9 @@ class Terrain:
             wide_m = random.uniform(2.5, 5.0)
             high_m = random.uniform(-0.12, 0.12) * wide_m
             heights += high_m * np.exp(-((x - at_x) ** 2 + (y - at_y) ** 2) / (2 * wide_m**2))
+        # In the middle, where a robot drives its rounds, the hills are half as steep: it slides on steep ones.
+        calm = np.clip((np.hypot(x, y) - 3.0) / 5.0, 0.0, 1.0)
+        heights *= 0.5 + 0.5 * calm * calm * (3 - 2 * calm)
         # Beside the ditch the ground is level, so that the bridge lies on both its edges.
         level = np.clip((np.abs(x - DITCH_X_M) - 2.0) / 2.0, 0.0, 1.0)
         heights *= level * level * (3 - 2 * level)
@@ -93,7 +96,7 @@ class Terrain:
 
     @classmethod
     def of_heights(cls, heights_m: Floats, random: Random, half_size_m: float = HALF_SIZE_M) -> "Terrain":
-        """Heights that are handed in, with wall, car and logs on them; no ditch and so no bridge. ValueError as above."""
+        """Heights that are handed in, with wall, car and logs on them; no ditch, so no bridge. ValueError as above."""
         ground = cls(heights_m, half_size_m=half_size_m)
         blocks = [block for block in ground.furniture(random) if block.label is not Label.BRIDGE]
         return cls(heights_m, (*_walls(half_size_m), *blocks), half_size_m)
