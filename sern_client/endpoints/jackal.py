@@ -137,6 +137,7 @@ class JackalSource:
         self._new = partial(_make, encoding)
         self._encoding = encoding
         self._seq: dict[str, int] = {}
+        self._now_s = 0.0
         self._path: deque[tuple[int, Pose2]] = deque(maxlen=_PATH_POSES)
         self._point_bytes = 18 if plant == "mujoco" else 16  # with a label, or without
         cells = max(1, math.isqrt(sizes.map_bytes))
@@ -167,6 +168,7 @@ class JackalSource:
 
     def advance(self, to_s: float) -> None:
         """Run the robot to `to_s` seconds after its start."""
+        self._now_s = to_s
         while self.robot.state.time_s + STEP_S <= to_s + 1e-9:
             if self._pilot is None:
                 self.robot.step()
@@ -200,8 +202,12 @@ class JackalSource:
         found = self._pilot.found
         return found.pose, found.speed_mps, found.yaw_rate_radps
 
+    def ready(self, plan: Plan) -> bool:
+        """Whether the topic has a message now: there is no plan while somebody commands the robot."""
+        return plan.name != PLAN.name or (self._pilot is not None and not self._pilot.held)
+
     def body(self, plan: Plan, stamp_ns: int) -> bytes:
-        """The message of a topic as of now; `stamp_ns` goes into its header."""
+        """The message of a topic as of now; `stamp_ns` goes into its header: the time of the last `advance`."""
         seq = self._seq[plan.name] = self._seq.get(plan.name, 0) + 1
         if plan.name == "/points":
             if self._clouds is not None:
@@ -445,9 +451,8 @@ class JackalSource:
 
     def _plan_message(self, stamp_ns: int, seq: int) -> Any:
         assert self._way is not None
-        now_s = self.robot.state.time_s
         poses = [
-            self._stamped_pose(stamp_ns + round((time_s - now_s) * 1e9), 0, pose)
+            self._stamped_pose(stamp_ns + round((time_s - self._now_s) * 1e9), 0, pose)
             for time_s, pose in self._way.waypoints()
         ]
         return self._new("nav_msgs/msg/Path", header=self._header(stamp_ns, "odom", seq), poses=poses)

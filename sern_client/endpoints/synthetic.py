@@ -180,6 +180,7 @@ class SyntheticEndpoint:
         self._start_s = 0.0
         self._start_ns = 0
         self._commanded_s: float | None = None
+        self._advanced_s = 0.0
 
     # Life cycle
 
@@ -333,20 +334,25 @@ class SyntheticEndpoint:
             heapq.heappush(due, (due_s + periods[i], i))
 
     def _advance(self, to_s: float) -> None:
-        timeout_s = self.options.command_timeout_s
+        timeout_s, replanned = self.options.command_timeout_s, False
         if timeout_s is not None and self._commanded_s is not None and to_s - self._commanded_s > timeout_s:
             self._commanded_s = None
-            if self._robot is not None and self._robot.release():
-                self._publish(self._topics[TopicName(PLAN.name)], to_s)
+            replanned = self._robot is not None and self._robot.release()
         self._source.advance(to_s)
+        self._advanced_s = to_s
+        if replanned:
+            self._publish(self._topics[TopicName(PLAN.name)], to_s)
 
     def _publish(self, topic: _Topic, at_s: float) -> None:
-        if not topic.subscriptions:
+        if not topic.subscriptions or not self._ready(topic):
             return
         body = self._body(topic, at_s)
         stamp_ns = self._clock.wall_ns()
         for subscription in list(topic.subscriptions):
             self._offer(subscription, body, stamp_ns)
+
+    def _ready(self, topic: _Topic) -> bool:
+        return self._robot is None or self._robot.ready(topic.plan)
 
     def _body(self, topic: _Topic, at_s: float) -> bytes:
         if topic.counter:
@@ -358,8 +364,8 @@ class SyntheticEndpoint:
 
     def _give_latched(self, subscription: _Subscription) -> None:
         """A late joiner of a latched topic gets it at once."""
-        if not subscription.closed:
-            body = self._body(subscription.topic, self._clock.monotonic_s() - self._start_s)
+        if not subscription.closed and self._ready(subscription.topic):
+            body = self._body(subscription.topic, self._advanced_s)
             self._offer(subscription, body, self._clock.wall_ns())
 
     def _offer(self, subscription: _Subscription, body: bytes, stamp_ns: int) -> None:
