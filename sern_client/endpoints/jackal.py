@@ -124,6 +124,8 @@ class JackalSource:
         """`follow`: it drives by a plan, and its odometry is where a localisation thinks it is. ConfigError: `plant`
         is mujoco, and that is not installed, or `patrol` is asked of it.
         """
+        if not 0 <= localisation_noise_m < math.inf:
+            raise ConfigError(f"localisation_noise_m must be 0 or more metres, not {localisation_noise_m}")
         self.robot: Plant = _plant(random, plant, patrol=patrol)
         self._random = Random(random.getrandbits(64))
         self._way: FigureOfEight | None = None
