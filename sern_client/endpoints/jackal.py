@@ -47,6 +47,7 @@ from sern_sim.follower import ON_HILLS, Reference
 from sern_sim.pilot import OFF_M, FigureOfEight, Pilot
 from sern_sim.plant import Plant
 from sern_sim.robot import GYRO_NOISE_RADPS, STEP_S, Pose2, SimulatedJackal
+from sern_sim.way_back import way_back
 
 ORIGIN_DEG: Final = (48.135, 10.068)
 """Latitude and longitude of the yard's centre."""
@@ -193,7 +194,9 @@ class JackalSource:
         if self._pilot is None or not self._pilot.held:
             return False
         self._pilot.held = False
-        self._way = FigureOfEight(self._random, self._pilot.found.pose, self.robot.state.time_s)
+        found = self._pilot.found.pose
+        back = way_back(self.robot.world, found)
+        self._way = FigureOfEight(self._random, found, self.robot.state.time_s, back)
         return True
 
     def _where(self) -> tuple[Pose2, float, float]:

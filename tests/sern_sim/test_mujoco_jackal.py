@@ -42,9 +42,11 @@ def run(robot: Plant, seconds: float) -> RobotState:
 def test_both_are_plants() -> None:
     plants: list[Plant] = [SimulatedJackal(Random(1)), MujocoJackal(Random(1))]
     for plant in plants:
-        assert not plant.commanded and plant.command == (0.0, 0.0) and 0.3 < plant.yaw_scale_known < 0.5
+        told = [plant.commanded]
+        assert plant.command == (0.0, 0.0) and 0.3 < plant.yaw_scale_known < 0.5
         plant.drive(0.5, 0.0)
-        assert plant.commanded and run(plant, 2.0).pose.x_m > 0.5
+        told.append(plant.commanded)
+        assert told == [False, True] and run(plant, 2.0).pose.x_m > 0.5
         assert len(plant.imu()) == 6 and plant.scan(90).shape == (90,)
         assert plant.world.occupancy(10).shape == (10, 10)
         assert plant.image(9, 7).shape == (7, 9, 3) and len(plant.cloud(100)) == 100

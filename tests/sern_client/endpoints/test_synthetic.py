@@ -430,7 +430,12 @@ async def test_commands_come_before_the_plan_and_a_new_one_after_them(
     publisher.publish(twist(0.0, 0.0, Encoding.ROS1), 1)
     await drive_until(endpoint, 5.2)
     late: list[bytes] = []
-    endpoint.subscribe(TopicName("/plan"), lambda body, stamp_ns: late.append(body) is None)
+
+    def joined_late(body: bytes, stamp_ns: int) -> bool:
+        late.append(body)
+        return True
+
+    endpoint.subscribe(TopicName("/plan"), joined_late)
     await drive_until(endpoint, 5.4)
     assert late == [] and len(rows["/plan"]) == told, "a robot under command has no plan"
     await drive_until(endpoint, 10.0)
