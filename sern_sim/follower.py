@@ -6,7 +6,7 @@ told the more; the integral of what its gyroscope misses takes up what is left o
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from sern_sim.robot import STEP_S, Pose2
 
@@ -28,6 +28,10 @@ class FollowerOptions:
     """How fast the integral of the turn grows: what the base turns less than it is to."""
     most_turn_radps: float = 2.0
     """The integral at the most: a robot that is held must not spin when it is let go."""
+
+
+ON_HILLS: Final = FollowerOptions(along_per_s=2.5, across_per_m2=8.0)
+"""Of a base that slides down slopes while it turns."""
 
 
 class Follower:

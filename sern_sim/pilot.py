@@ -6,12 +6,13 @@ beside that, as that of a filter does which corrects wheels by a scanner.
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from random import Random
 from typing import Final, NamedTuple
 
-from sern_sim.follower import Follower, Reference
-from sern_sim.robot import STEP_S, Pose2, SimulatedJackal
+from sern_sim.follower import Follower, FollowerOptions, Reference
+from sern_sim.plant import Plant
+from sern_sim.robot import STEP_S, Pose2
 
 TAU: Final = 2 * math.pi
 OFF_M: Final = 0.01
@@ -23,8 +24,6 @@ NOISE_SHARE: Final = 0.3
 """What a pose trembles, as a share of that."""
 NOISE_MPS: Final = 0.01
 NOISE_RADPS: Final = 0.01
-YAW_SCALE: Final = 0.45
-"""What the robot's maker thinks that its base makes of a turn. The plant's is between 0.35 and 0.55."""
 
 
 class Found(NamedTuple):
@@ -42,16 +41,17 @@ class Pilot:
     def __init__(
         self,
         random: Random,
-        robot: SimulatedJackal,
+        robot: Plant,
         reference: Callable[[float], Reference],
         *,
         off_m: float = OFF_M,
+        follower: FollowerOptions | None = None,
     ) -> None:
         self._random = random
         self._robot = robot
         self._reference = reference
         self._off_m = off_m
-        self._follower = Follower(YAW_SCALE)
+        self._follower = Follower(robot.yaw_scale_known, follower)
         self._off = [random.gauss(0.0, sigma) for sigma in self._sigmas()]
         self.held = False
         """Somebody else commands the robot."""
@@ -98,6 +98,10 @@ SPEED_MPS: Final = 0.7
 ACCEL_MPS2: Final = 0.5
 MOST_TURN_RADPS: Final = 0.8
 TURN_ACCEL_RADPS2: Final = 1.5
+BACK_AHEAD_M: Final = 0.5
+BACK_MPS: Final = 0.45
+"""On the way back to the middle, which may be narrow."""
+TURNED_RAD: Final = 0.3
 AHEAD_S: Final = 90.0
 """How far the plan reaches."""
 PART_S: Final = 0.5
@@ -108,7 +112,10 @@ class FigureOfEight:
     """A plan without an end around the middle of the yard: an ideal robot drives it `AHEAD_S` ahead of the real one, by
     pure pursuit (Coulter 1992), with speeds and turns that a Jackal can follow."""
 
-    def __init__(self, random: Random, start: Pose2, start_s: float) -> None:
+    def __init__(self, random: Random, start: Pose2, start_s: float, back: Sequence[tuple[float, float]] = ()) -> None:
+        """`back`: places that it goes by first, in metres (`way_back`); it turns to the first of them on the spot."""
+        self._back = deque(back)
+        self._turns = bool(back)
         self._waves = [(random.uniform(0.03, 0.1), random.uniform(0.0, TAU)) for _ in range(2)]
         self._begin_s = start_s
         self._first = 0  # step of the oldest reference that is kept
@@ -147,22 +154,39 @@ class FigureOfEight:
     def _drive(self) -> None:
         pose = self._pose
         self._steps.append(Reference(pose, self._speed_mps, self._turn_radps))
-        for _ in range(400):
-            x_m, y_m = self._place(self._angle_rad)
-            if math.dist((x_m, y_m), (pose.x_m, pose.y_m)) >= LOOK_AHEAD_M:
-                break
-            self._angle_rad += 0.01
+        x_m, y_m = self._goal(pose)
         ahead_x_m, ahead_y_m = x_m - pose.x_m, y_m - pose.y_m
         left_m = math.cos(pose.yaw_rad) * ahead_y_m - math.sin(pose.yaw_rad) * ahead_x_m
         front_m = math.cos(pose.yaw_rad) * ahead_x_m + math.sin(pose.yaw_rad) * ahead_y_m
         time_s = (self._first + len(self._steps)) * STEP_S
         wave = sum(math.sin(TAU * rate_hz * time_s + phase_rad) for rate_hz, phase_rad in self._waves)
-        turn_radps = 2 * left_m / (left_m**2 + front_m**2) * self._speed_mps
+        speed_mps, curvature_per_m = SPEED_MPS + 0.1 * wave, 2 * left_m / max(left_m**2 + front_m**2, 1e-6)
+        turn_radps = curvature_per_m * self._speed_mps
         if front_m < 0:
             turn_radps = math.copysign(MOST_TURN_RADPS, left_m)
+        self._turns = self._turns and abs(math.atan2(left_m, front_m)) > TURNED_RAD
+        if self._turns:
+            speed_mps, turn_radps = 0.0, math.copysign(MOST_TURN_RADPS, left_m)
+        elif self._back:
+            speed_mps = min(BACK_MPS, 0.8 * MOST_TURN_RADPS / max(abs(curvature_per_m), 1e-6))
         limit = TURN_ACCEL_RADPS2 * STEP_S
         turn_radps = min(max(turn_radps, -MOST_TURN_RADPS), MOST_TURN_RADPS)
         self._turn_radps += min(max(turn_radps - self._turn_radps, -limit), limit)
         faster = ACCEL_MPS2 * STEP_S
-        self._speed_mps += min(max(SPEED_MPS + 0.1 * wave - self._speed_mps, -faster), faster)
+        self._speed_mps += min(max(speed_mps - self._speed_mps, -faster), faster)
         self._pose = pose.moved(self._speed_mps * STEP_S, self._turn_radps * STEP_S)
+
+    def _goal(self, pose: Pose2) -> tuple[float, float]:
+        """The place that it makes for: a little ahead on the way back, and then on the figure."""
+        while self._back:
+            if math.dist(self._back[0], (pose.x_m, pose.y_m)) >= BACK_AHEAD_M:
+                return self._back[0]
+            self._back.popleft()
+            if not self._back:
+                self._angle_rad = self._nearest(pose)
+        for _ in range(400):
+            x_m, y_m = self._place(self._angle_rad)
+            if math.dist((x_m, y_m), (pose.x_m, pose.y_m)) >= LOOK_AHEAD_M:
+                break
+            self._angle_rad += 0.01
+        return x_m, y_m

@@ -10,7 +10,7 @@ true speed `speed_scale` times; wheel odometry is calibrated for the mean slip a
 import math
 from dataclasses import dataclass
 from random import Random
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,10 +69,27 @@ class RobotState:
     charge: float = 1.0  # of the battery, 0 to 1
     travelled_m: float = 0.0
     blocked: bool = False  # held by an obstacle in this step
+    z_m: float = 0.0
+    roll_rad: float = 0.0
+    pitch_rad: float = 0.0  # nose down positive, as in REP 103
+
+
+class Inertial(NamedTuple):
+    """What an inertial unit measures, in the body's axes: rates in rad/s, specific force in m/s²."""
+
+    yaw_radps: float
+    forward_mps2: float
+    left_mps2: float
+    up_mps2: float = GRAVITY_MPS2
+    roll_radps: float = 0.0
+    pitch_radps: float = 0.0
 
 
 class SimulatedJackal:
     """The robot in its world. `patrol` drives a seeded figure of eight while no command is in force."""
+
+    yaw_scale_known = 0.45
+    """What its maker thinks that its base makes of a turn. What it does make is between 0.35 and 0.55."""
 
     def __init__(self, random: Random, *, world: World | None = None, patrol: bool = False) -> None:
         self.world = world or World.yard(random)
@@ -107,10 +124,10 @@ class SimulatedJackal:
         before = self.state
         self._steps += 1
         speed_goal, turn_goal = self.command if self.commanded else self._wander(before.time_s)
-        speed = _approach(self._driven_mps, _clamp(speed_goal, MAX_SPEED_MPS) * self.speed_scale, MAX_ACCEL_MPS2)
+        speed = approach(self._driven_mps, clamp(speed_goal, MAX_SPEED_MPS) * self.speed_scale, MAX_ACCEL_MPS2)
         self._driven_mps = speed
-        turn_goal = _clamp(turn_goal, MAX_YAW_RATE_RADPS) * (self.yaw_scale if self.commanded else 1.0)
-        turn = _approach(before.yaw_rate_radps, turn_goal, MAX_YAW_ACCEL_RADPS2)
+        turn_goal = clamp(turn_goal, MAX_YAW_RATE_RADPS) * (self.yaw_scale if self.commanded else 1.0)
+        turn = approach(before.yaw_rate_radps, turn_goal, MAX_YAW_ACCEL_RADPS2)
         pose = before.pose.moved(speed * STEP_S, turn * STEP_S)
         clearance = self.world.clearance_m(pose.x_m, pose.y_m)
         blocked = clearance < BODY_RADIUS_M and clearance < self.world.clearance_m(before.pose.x_m, before.pose.y_m)
@@ -146,11 +163,11 @@ class SimulatedJackal:
 
     # Sensors: each reads the present state; their noise is seeded too, in the order of the calls
 
-    def imu(self) -> tuple[float, float, float]:
-        """(yaw rate rad/s, forward and leftward acceleration m/s²), with bias and noise."""
+    def imu(self) -> Inertial:
+        """Yaw rate, forward and leftward acceleration, with bias and noise; the ground is level."""
         state = self.state
         gauss = self._sensor_random.gauss
-        return (
+        return Inertial(
             state.yaw_rate_radps + self._gyro_bias_radps + gauss(0.0, GYRO_NOISE_RADPS),
             state.accel_mps2 + gauss(0.0, ACCEL_NOISE_MPS2),
             state.speed_mps * state.yaw_rate_radps + gauss(0.0, ACCEL_NOISE_MPS2),
@@ -201,13 +218,14 @@ class SimulatedJackal:
         return np.repeat(grey[:, :, None], 3, axis=2)
 
 
-def _approach(value: float, goal: float, rate: float) -> float:
+def approach(value: float, goal: float, rate: float) -> float:
     """`value` moved towards `goal` by at most `rate` times one step."""
     return value + min(max(goal - value, -rate * STEP_S), rate * STEP_S)
 
 
-def _clamp(value: float, limit: float) -> float:
+def clamp(value: float, limit: float) -> float:
+    """`value` between -limit and limit."""
     return min(max(value, -limit), limit)
 
 
-__all__ = ["STEP_S", "Floats", "Pose2", "RobotState", "SimulatedJackal"]
+__all__ = ["STEP_S", "Floats", "Inertial", "Pose2", "RobotState", "SimulatedJackal", "approach", "clamp"]

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from sern_sim.follower import Reference
-from sern_sim.pilot import YAW_SCALE, Pilot
+from sern_sim.pilot import Pilot
 from sern_sim.robot import Pose2, SimulatedJackal
 from sern_sim.world import World
 from sern_twin.motion import TAU, Motion, Twist
@@ -79,5 +79,5 @@ class Robot:
             before.time_s,
             Motion(pose.x_m, pose.y_m, pose.yaw_rad, twist),
             Motion(found.pose.x_m, found.pose.y_m, found.pose.yaw_rad, measured, accel_mps2),
-            Twist(command[0], 0.0, command[1] * YAW_SCALE),
+            Twist(command[0], 0.0, command[1] * self._plant.yaw_scale_known),
         )

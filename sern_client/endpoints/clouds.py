@@ -12,6 +12,7 @@ from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 
 CLOUD_TYPE: Final = "sensor_msgs/msg/PointCloud2"
+_UINT16: Final = 4  # sensor_msgs/PointField.UINT16
 _FLOAT32: Final = 7  # sensor_msgs/PointField.FLOAT32
 _MAX_HEADER_BYTES: Final = 65536
 _DTYPES: Final = {
@@ -80,13 +81,26 @@ def _header(path: Path, lines: list[list[str]]) -> tuple[str, int, list[tuple[st
 
 
 def cloud_body(points: NDArray[np.float32], stamp_ns: int, frame_id: str, encoding: Encoding, seq: int = 0) -> bytes:
-    """A PointCloud2 body of (n, 3) x y z or (n, 4) x y z intensity; unordered, little endian."""
-    names = ("x", "y", "z", "intensity")[: points.shape[1]]
-    step = 4 * len(names)
+    """A PointCloud2 body of (n, 3) x y z, (n, 4) x y z intensity or (n, 5) x y z intensity label; unordered, little
+    endian. The label goes as uint16, all else as float32.
+    """
+    names = ("x", "y", "z", "intensity", "label")[: points.shape[1]]
     fields = [
-        ros_types.new("sensor_msgs/msg/PointField", encoding, name=name, offset=4 * i, datatype=_FLOAT32, count=1)
+        ros_types.new(
+            "sensor_msgs/msg/PointField",
+            encoding,
+            name=name,
+            offset=4 * i,
+            datatype=_UINT16 if name == "label" else _FLOAT32,
+            count=1,
+        )
         for i, name in enumerate(names)
     ]
+    data = np.ascontiguousarray(points[:, :4], dtype="<f4").view(np.uint8).reshape(len(points), -1)
+    if "label" in names:
+        labels = np.ascontiguousarray(points[:, 4:5], dtype="<u2").view(np.uint8)
+        data = np.concatenate([data, labels.reshape(len(points), 2)], axis=1)
+    step = data.shape[1]
     message = ros_types.new(
         CLOUD_TYPE,
         encoding,
@@ -96,7 +110,7 @@ def cloud_body(points: NDArray[np.float32], stamp_ns: int, frame_id: str, encodi
         fields=fields,
         point_step=step,
         row_step=step * len(points),
-        data=np.ascontiguousarray(points, dtype="<f4").reshape(-1).view(np.uint8),
+        data=data.reshape(-1),
         is_dense=not bool(np.isnan(points).any()),
     )
     return ros_types.serialise(message, CLOUD_TYPE, encoding)

@@ -8,7 +8,7 @@
 | /tf | tf2_msgs/TFMessage | pose_rate_hz | reliable |
 | /tf_static | tf2_msgs/TFMessage | once | reliable, latched |
 | /scan | sensor_msgs/LaserScan | 10 | best effort |
-| /points | sensor_msgs/PointCloud2 | cloud_rate_hz, bulk | best effort |
+| /points | sensor_msgs/PointCloud2, of plant mujoco with a label | cloud_rate_hz, bulk | best effort |
 | /map | nav_msgs/OccupancyGrid | map_rate_hz, bulk | reliable, latched |
 | /map_updates | map_msgs/OccupancyGridUpdate | 1, bulk | reliable |
 | /camera/image_raw | sensor_msgs/Image | 5, bulk | best effort |
@@ -23,6 +23,7 @@
 | /temperature | sensor_msgs/Temperature | 1 | best effort |
 | /e_stop | std_msgs/Bool | once | reliable, latched |
 | /plan | nav_msgs/Path with times, the next 90 s; only of a robot that follows one | 1/30 | reliable, latched |
+| /ground_truth | nav_msgs/Odometry, the truth; only of a robot that follows a plan | pose_rate_hz | reliable |
 
 In ROS 1 a publisher does not say whether it is reliable, so there `reliable` is None. Frames: map = odom, base_link,
 imu_link, velodyne, camera.
@@ -39,11 +40,14 @@ from typing import Any, Final
 import numpy as np
 
 from sern_client.endpoints.clouds import CLOUD_TYPE, CloudSource, cloud_body
+from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
-from sern_sim.follower import Reference
+from sern_sim.follower import ON_HILLS, Reference
 from sern_sim.pilot import OFF_M, FigureOfEight, Pilot
-from sern_sim.robot import GRAVITY_MPS2, GYRO_NOISE_RADPS, STEP_S, Pose2, SimulatedJackal
+from sern_sim.plant import Plant
+from sern_sim.robot import GYRO_NOISE_RADPS, STEP_S, Pose2, SimulatedJackal
+from sern_sim.way_back import way_back
 
 ORIGIN_DEG: Final = (48.135, 10.068)
 """Latitude and longitude of the yard's centre."""
@@ -89,11 +93,14 @@ JACKAL: Final = (
 
 
 PLAN: Final = Plan("/plan", "nav_msgs/msg/Path", 1 / 30, True, latched=True)
+TRUTH: Final = Plan("/ground_truth", "nav_msgs/msg/Odometry", 50.0, True, pose=True)
+"""What a robot that follows a plan has beside `JACKAL`: its localisation is off, so that the truth is told apart."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sizes:
-    """Bytes of the heavy bodies, each within one element of what is asked (16 per point, 1 per cell, 3 per pixel)."""
+    """Bytes of the heavy bodies, each within one element of what is asked (16 per point, 18 with a label, 1 per cell,
+    3 per pixel)."""
 
     cloud_bytes: int = 100_000
     map_bytes: int = 40_000
@@ -113,25 +120,33 @@ class JackalSource:
         cloud_files: tuple[Path, ...] = (),
         follow: bool = False,
         localisation_noise_m: float = OFF_M,
+        plant: str = "unicycle",
     ) -> None:
-        """`follow`: it drives by a plan, and its odometry is where a localisation thinks it is."""
-        self.robot = SimulatedJackal(random, patrol=patrol)
+        """`follow`: it drives by a plan, and its odometry is where a localisation thinks it is. ConfigError: `plant`
+        is mujoco, and that is not installed, or `patrol` is asked of it.
+        """
+        if not 0 <= localisation_noise_m < math.inf:
+            raise ConfigError(f"localisation_noise_m must be 0 or more metres, not {localisation_noise_m}")
+        self.robot: Plant = _plant(random, plant, patrol=patrol)
         self._random = Random(random.getrandbits(64))
         self._way: FigureOfEight | None = None
         self._pilot: Pilot | None = None
         if follow:
             self._way = FigureOfEight(self._random, self.robot.state.pose, 0.0)
-            self._pilot = Pilot(self._random, self.robot, self._planned, off_m=localisation_noise_m)
+            law = ON_HILLS if plant == "mujoco" else None
+            self._pilot = Pilot(self._random, self.robot, self._planned, off_m=localisation_noise_m, follower=law)
         self._sizes = sizes
         self._clouds = CloudSource(cloud_files, encoding) if cloud_files else None
         self._new = partial(_make, encoding)
         self._encoding = encoding
         self._seq: dict[str, int] = {}
+        self._now_s = 0.0
         self._path: deque[tuple[int, Pose2]] = deque(maxlen=_PATH_POSES)
+        self._point_bytes = 18 if plant == "mujoco" else 16  # with a label, or without
         cells = max(1, math.isqrt(sizes.map_bytes))
         self._grid = self.robot.world.occupancy(cells)
         self._build = {
-            "/odometry/filtered": self._odometry_true,
+            "/odometry/filtered": self._odometry_found,
             "/jackal_velocity_controller/odom": self._odometry_wheels,
             "/imu/data": self._imu,
             "/tf": self._tf,
@@ -151,10 +166,12 @@ class JackalSource:
             "/temperature": self._temperature,
             "/e_stop": self._e_stop,
             "/plan": self._plan_message,
+            "/ground_truth": self._odometry_ground_truth,
         }
 
     def advance(self, to_s: float) -> None:
         """Run the robot to `to_s` seconds after its start."""
+        self._now_s = to_s
         while self.robot.state.time_s + STEP_S <= to_s + 1e-9:
             if self._pilot is None:
                 self.robot.step()
@@ -177,7 +194,9 @@ class JackalSource:
         if self._pilot is None or not self._pilot.held:
             return False
         self._pilot.held = False
-        self._way = FigureOfEight(self._random, self._pilot.found.pose, self.robot.state.time_s)
+        found = self._pilot.found.pose
+        back = way_back(self.robot.world, found)
+        self._way = FigureOfEight(self._random, found, self.robot.state.time_s, back)
         return True
 
     def _where(self) -> tuple[Pose2, float, float]:
@@ -188,13 +207,17 @@ class JackalSource:
         found = self._pilot.found
         return found.pose, found.speed_mps, found.yaw_rate_radps
 
+    def ready(self, plan: Plan) -> bool:
+        """Whether the topic has a message now: there is no plan while somebody commands the robot."""
+        return plan.name != PLAN.name or (self._pilot is not None and not self._pilot.held)
+
     def body(self, plan: Plan, stamp_ns: int) -> bytes:
-        """The message of a topic as of now; `stamp_ns` goes into its header."""
+        """The message of a topic as of now; `stamp_ns` goes into its header: the time of the last `advance`."""
         seq = self._seq[plan.name] = self._seq.get(plan.name, 0) + 1
         if plan.name == "/points":
             if self._clouds is not None:
                 return self._clouds.next_body(stamp_ns)
-            points = self.robot.cloud(max(1, self._sizes.cloud_bytes // 16))
+            points = self.robot.cloud(max(1, self._sizes.cloud_bytes // self._point_bytes))
             return cloud_body(points, stamp_ns, "velodyne", self._encoding, seq)
         message = self._build[plan.name](stamp_ns, seq)
         return ros_types.serialise(message, plan.type_name, self._encoding)
@@ -207,12 +230,29 @@ class JackalSource:
     def _vector(self, x: float = 0.0, y: float = 0.0, z: float = 0.0, kind: str = "Vector3") -> Any:
         return self._new(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
 
-    def _turned(self, yaw_rad: float) -> Any:
-        return self._new("geometry_msgs/msg/Quaternion", z=math.sin(yaw_rad / 2), w=math.cos(yaw_rad / 2))
+    def _turned(self, yaw_rad: float, roll_rad: float = 0.0, pitch_rad: float = 0.0) -> Any:
+        """Yaw, then pitch, then roll about the axes as turned before: a quaternion (REP 103)."""
+        (cos_y, sin_y), (cos_p, sin_p), (cos_r, sin_r) = (
+            (math.cos(angle / 2), math.sin(angle / 2)) for angle in (yaw_rad, pitch_rad, roll_rad)
+        )
+        return self._new(
+            "geometry_msgs/msg/Quaternion",
+            x=sin_r * cos_p * cos_y - cos_r * sin_p * sin_y,
+            y=cos_r * sin_p * cos_y + sin_r * cos_p * sin_y,
+            z=cos_r * cos_p * sin_y - sin_r * sin_p * cos_y,
+            w=cos_r * cos_p * cos_y + sin_r * sin_p * sin_y,
+        )
 
     def _pose_of(self, pose: Pose2) -> Any:
         position = self._vector(pose.x_m, pose.y_m, kind="Point")
         return self._new("geometry_msgs/msg/Pose", position=position, orientation=self._turned(pose.yaw_rad))
+
+    def _pose_on_ground(self, pose: Pose2) -> Any:
+        """With the height and the tilt that the robot has now."""
+        state = self.robot.state
+        position = self._vector(pose.x_m, pose.y_m, state.z_m, kind="Point")
+        orientation = self._turned(pose.yaw_rad, state.roll_rad, state.pitch_rad)
+        return self._new("geometry_msgs/msg/Pose", position=position, orientation=orientation)
 
     def _twist(self, speed_mps: float, yaw_rate_radps: float) -> Any:
         return self._new(
@@ -242,32 +282,38 @@ class JackalSource:
             "nav_msgs/msg/Odometry",
             header=self._header(stamp_ns, "odom", seq),
             child_frame_id="base_link",
-            pose=self._new(where, pose=self._pose_of(pose), covariance=covariance),
+            pose=self._new(where, pose=self._pose_on_ground(pose), covariance=covariance),
             twist=self._new(moving, twist=self._twist(*twist), covariance=covariance),
         )
 
-    def _odometry_true(self, stamp_ns: int, seq: int) -> Any:
+    def _odometry_found(self, stamp_ns: int, seq: int) -> Any:
         pose, *twist = self._where()
         return self._odometry(stamp_ns, seq, pose, 1e-4, (twist[0], twist[1]))
+
+    def _odometry_ground_truth(self, stamp_ns: int, seq: int) -> Any:
+        state = self.robot.state
+        return self._odometry(stamp_ns, seq, state.pose, 0.0, (state.speed_mps, state.yaw_rate_radps))
 
     def _odometry_wheels(self, stamp_ns: int, seq: int) -> Any:
         state = self.robot.state
         return self._odometry(stamp_ns, seq, state.odometry, 1e-2, (state.speed_mps, state.yaw_rate_radps))
 
     def _imu(self, stamp_ns: int, seq: int) -> Any:
-        yaw_rate, forward, left = self.robot.imu()
+        felt, state = self.robot.imu(), self.robot.state
         return self._new(
             "sensor_msgs/msg/Imu",
             header=self._header(stamp_ns, "imu_link", seq),
-            orientation=self._turned(self.robot.state.pose.yaw_rad),
-            angular_velocity=self._vector(z=yaw_rate),
+            orientation=self._turned(state.pose.yaw_rad, state.roll_rad, state.pitch_rad),
+            angular_velocity=self._vector(felt.roll_radps, felt.pitch_radps, felt.yaw_radps),
             angular_velocity_covariance=np.diag([GYRO_NOISE_RADPS**2] * 3).reshape(-1),
-            linear_acceleration=self._vector(forward, left, GRAVITY_MPS2),
+            linear_acceleration=self._vector(felt.forward_mps2, felt.left_mps2, felt.up_mps2),
         )
 
     def _tf(self, stamp_ns: int, seq: int) -> Any:
         del seq
-        moved = self._transform(stamp_ns, "base_link", self._where()[0], parent="odom")
+        state = self.robot.state
+        moved = self._transform(stamp_ns, "base_link", self._where()[0], state.z_m, parent="odom")
+        moved.transform.rotation = self._turned(self._where()[0].yaw_rad, state.roll_rad, state.pitch_rad)
         return self._new("tf2_msgs/msg/TFMessage", transforms=[moved])
 
     def _tf_static(self, stamp_ns: int, seq: int) -> Any:
@@ -410,9 +456,8 @@ class JackalSource:
 
     def _plan_message(self, stamp_ns: int, seq: int) -> Any:
         assert self._way is not None
-        now_s = self.robot.state.time_s
         poses = [
-            self._stamped_pose(stamp_ns + round((time_s - now_s) * 1e9), 0, pose)
+            self._stamped_pose(stamp_ns + round((time_s - self._now_s) * 1e9), 0, pose)
             for time_s, pose in self._way.waypoints()
         ]
         return self._new("nav_msgs/msg/Path", header=self._header(stamp_ns, "odom", seq), poses=poses)
@@ -424,6 +469,18 @@ class JackalSource:
     def _e_stop(self, stamp_ns: int, seq: int) -> Any:
         del stamp_ns, seq
         return self._new("std_msgs/msg/Bool", data=False)
+
+
+def _plant(random: Random, kind: str, *, patrol: bool) -> Plant:
+    if kind == "unicycle":
+        return SimulatedJackal(random, patrol=patrol)
+    if kind != "mujoco":
+        raise ConfigError(f"plant {kind!r} is not known; accepted: unicycle, mujoco")
+    if patrol:
+        raise ConfigError("plant mujoco has no patrol; let it follow a plan (follow: true)")
+    from sern_sim.mujoco_jackal import MujocoJackal
+
+    return MujocoJackal(random)
 
 
 class OperatorSource:

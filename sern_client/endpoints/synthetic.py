@@ -18,7 +18,7 @@ from sern_client.endpoints.base import Difference, Held, Sink, TopicEvents
 from sern_client.endpoints.clock import Clock, SystemClock
 from sern_client.endpoints.common.held import HeldSubscription
 from sern_client.endpoints.common.saying import say_failure
-from sern_client.endpoints.jackal import JACKAL, PLAN, JackalSource, OperatorSource, Plan, Sizes
+from sern_client.endpoints.jackal import JACKAL, PLAN, TRUTH, JackalSource, OperatorSource, Plan, Sizes
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding, TopicName
@@ -48,6 +48,7 @@ class SyntheticOptions:
     whose text is `<topic> <n>`, n = 1, 2, 3... without a gap. `command_timeout_s` stops the robot when commands cease;
     None leaves that to whoever guards the link. `follow`: it drives by a plan, which it publishes, in closed loop with
     a localisation that is off by `localisation_noise_m`; commands come first, and after their end there is a new plan.
+    `plant`: what drives: a unicycle in a flat yard, or MuJoCo, four wheels that skid on hills (the extra `sim`).
     The fields from `command_topic` on are the operator's.
     """
 
@@ -55,6 +56,7 @@ class SyntheticOptions:
     encoding: Literal["ros1", "cdr"] = "ros1"
     role: Literal["robot", "operator"] = "robot"
     topics: int | tuple[str, ...] = 20
+    plant: Literal["unicycle", "mujoco"] = "unicycle"
     patrol: bool = False
     cloud_bytes: int = 100_000
     cloud_rate_hz: float = 10.0
@@ -167,6 +169,7 @@ class SyntheticEndpoint:
                 cloud_files=options.cloud_files,
                 follow=options.follow,
                 localisation_noise_m=options.localisation_noise_m,
+                plant=options.plant,
             )
         else:
             self._source = OperatorSource(random, self._encoding)
@@ -177,6 +180,7 @@ class SyntheticEndpoint:
         self._start_s = 0.0
         self._start_ns = 0
         self._commanded_s: float | None = None
+        self._advanced_s = 0.0
 
     # Life cycle
 
@@ -276,7 +280,7 @@ class SyntheticEndpoint:
         if options.role == "robot":
             topics = [self._topic(self._rated(plan)) for plan in _chosen(options.topics)]
             if options.follow:
-                topics.append(self._topic(PLAN))
+                topics += [self._topic(PLAN), self._topic(self._rated(TRUTH))]
         else:
             twist = "geometry_msgs/msg/TwistStamped" if options.command_stamped else "geometry_msgs/msg/Twist"
             goal = Plan(options.goal_topic, "geometry_msgs/msg/PoseStamped", options.goal_rate_hz, reliable=True)
@@ -330,20 +334,25 @@ class SyntheticEndpoint:
             heapq.heappush(due, (due_s + periods[i], i))
 
     def _advance(self, to_s: float) -> None:
-        timeout_s = self.options.command_timeout_s
+        timeout_s, replanned = self.options.command_timeout_s, False
         if timeout_s is not None and self._commanded_s is not None and to_s - self._commanded_s > timeout_s:
             self._commanded_s = None
-            if self._robot is not None and self._robot.release():
-                self._publish(self._topics[TopicName(PLAN.name)], to_s)
+            replanned = self._robot is not None and self._robot.release()
         self._source.advance(to_s)
+        self._advanced_s = to_s
+        if replanned:
+            self._publish(self._topics[TopicName(PLAN.name)], to_s)
 
     def _publish(self, topic: _Topic, at_s: float) -> None:
-        if not topic.subscriptions:
+        if not topic.subscriptions or not self._ready(topic):
             return
         body = self._body(topic, at_s)
         stamp_ns = self._clock.wall_ns()
         for subscription in list(topic.subscriptions):
             self._offer(subscription, body, stamp_ns)
+
+    def _ready(self, topic: _Topic) -> bool:
+        return self._robot is None or self._robot.ready(topic.plan)
 
     def _body(self, topic: _Topic, at_s: float) -> bytes:
         if topic.counter:
@@ -355,8 +364,8 @@ class SyntheticEndpoint:
 
     def _give_latched(self, subscription: _Subscription) -> None:
         """A late joiner of a latched topic gets it at once."""
-        if not subscription.closed:
-            body = self._body(subscription.topic, self._clock.monotonic_s() - self._start_s)
+        if not subscription.closed and self._ready(subscription.topic):
+            body = self._body(subscription.topic, self._advanced_s)
             self._offer(subscription, body, self._clock.wall_ns())
 
     def _offer(self, subscription: _Subscription, body: bytes, stamp_ns: int) -> None:

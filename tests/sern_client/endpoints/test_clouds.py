@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sern_client.endpoints.clouds import CLOUD_TYPE, CloudSource, cloud_body, read_ply
+from sern_core.summaries.voxel import thin_cloud
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
@@ -73,3 +74,16 @@ def test_real_scans(data: Callable[[str], Path]) -> None:
     assert [message.width for message in messages] == [69792, 69088, 69792]
     points = messages[0].data.view("<f4").reshape(-1, messages[0].point_step // 4)
     assert np.isfinite(points).all() and 1.0 < float(np.abs(points[:, :2]).max()) < 500.0
+
+
+@pytest.mark.parametrize("encoding", [Encoding.ROS1, Encoding.CDR])
+def test_labels_go_as_whole_numbers_and_outlive_a_summary(encoding: Encoding) -> None:
+    points = np.array([[0.0, 0.0, 0.0, 9.0, 1.0], [5.0, 0.0, 0.0, 8.0, 5.0], [np.nan] * 3 + [0.0, 0.0]], np.float32)
+    body = cloud_body(points, 1, "velodyne", encoding)
+    row = np.dtype([("xyzi", "<f4", 4), ("label", "<u2")])
+    read = ros_types.deserialise(body, CLOUD_TYPE, encoding)
+    rows = np.frombuffer(read.data.tobytes(), dtype=row)
+    assert np.array_equal(rows["xyzi"], points[:, :4], equal_nan=True) and rows["label"].tolist() == [1, 5, 0]
+    assert read.point_step == 18 and not read.is_dense
+    thin = ros_types.deserialise(thin_cloud(body, encoding, 0.5), CLOUD_TYPE, encoding)
+    assert sorted(np.frombuffer(thin.data.tobytes(), dtype=row)["label"].tolist()) == [1, 5]

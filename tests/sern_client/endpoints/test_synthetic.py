@@ -3,14 +3,16 @@
 import asyncio
 import logging
 import math
+import sys
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from random import Random
-from typing import Any
+from typing import Any, Literal
 
+import numpy as np
 import pytest
 
-from sern_client.endpoints.jackal import JACKAL, PLAN, JackalSource, Plan, Sizes
+from sern_client.endpoints.jackal import JACKAL, PLAN, TRUTH, JackalSource, Plan, Sizes
 from sern_client.endpoints.synthetic import SyntheticEndpoint, SyntheticOptions
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
@@ -341,3 +343,146 @@ def test_after_commands_it_makes_a_new_plan_from_where_it_is() -> None:
     assert [pose.pose.position.x for pose in after.poses[:20]] != [pose.pose.position.x for pose in before.poses[4:24]]
     source.advance(60.0)
     assert source.robot.state.travelled_m > 20
+
+
+def follower_of(plant: str, noise_m: float = 0.01) -> JackalSource:
+    if plant == "mujoco":
+        pytest.importorskip("mujoco", reason="the extra sim is not installed")
+    return JackalSource(
+        Random(4), Encoding.CDR, Sizes(), patrol=False, follow=True, localisation_noise_m=noise_m, plant=plant
+    )
+
+
+@pytest.mark.parametrize("plant", ["unicycle", "mujoco"])
+def test_it_stays_on_the_plan_it_told_and_says_how_far_its_localisation_is_off(plant: str) -> None:
+    """Over a minute after the plan was told, as a twin would take it through a blackout."""
+    source = follower_of(plant)
+    source.advance(1.0)
+    poses = read(source, PLAN, 10**18).poses
+    filtered = next(plan for plan in JACKAL if plan.name == "/odometry/filtered")
+    tracked_m, off_m = [], []
+    for planned in poses:
+        at_s = planned.header.stamp.sec + planned.header.stamp.nanosec / 1e9 - 1e9
+        if not 0 < at_s <= 60:
+            continue
+        source.advance(1.0 + at_s)
+        true = read(source, TRUTH).pose.pose.position
+        thought = read(source, filtered).pose.pose.position
+        tracked_m.append(math.dist((true.x, true.y), (planned.pose.position.x, planned.pose.position.y)))
+        off_m.append(math.dist((true.x, true.y), (thought.x, thought.y)))
+    assert len(tracked_m) > 110
+    assert sorted(tracked_m)[round(0.95 * len(tracked_m))] < 0.1
+    # In each axis one sigma is 1 cm, a share of it white; what a step moves it, 1.5 cm, is in it too.
+    assert 0.005 < sum(off_m) / len(off_m) < 0.035
+    assert (true.x, true.y) == (source.robot.state.pose.x_m, source.robot.state.pose.y_m)
+
+
+def test_on_hills_its_messages_have_height_and_tilt_and_its_clouds_labels() -> None:
+    source = follower_of("mujoco", 0.0)
+    tilted = 0.0
+    for step in range(40):
+        source.advance(step * 0.5)
+        state = source.robot.state
+        pose = read(source, TRUTH).pose.pose
+        transform = read(source, next(plan for plan in JACKAL if plan.name == "/tf")).transforms[0].transform
+        imu = read(source, next(plan for plan in JACKAL if plan.name == "/imu/data"))
+        assert pose.position.z == transform.translation.z == state.z_m != 0.0
+        turned = imu.orientation
+        up = 1 - 2 * (turned.x**2 + turned.y**2)
+        assert up == pytest.approx(math.cos(state.roll_rad) * math.cos(state.pitch_rad))
+        assert 2 * (turned.w * turned.y - turned.z * turned.x) == pytest.approx(math.sin(state.pitch_rad))
+        assert (pose.orientation.x, pose.orientation.y) == (turned.x, turned.y)
+        tilted = max(tilted, abs(state.pitch_rad))
+    assert tilted > 0.01
+    cloud = read(source, next(plan for plan in JACKAL if plan.name == "/points"))
+    assert [(field.name, field.offset, field.datatype) for field in cloud.fields] == [
+        ("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("intensity", 12, 7), ("label", 16, 4),
+    ]  # fmt: skip
+    assert cloud.point_step == 18 and cloud.row_step == len(cloud.data) == 18 * cloud.width
+    assert abs(len(cloud.data) - 100_000) <= 18
+    labels = np.frombuffer(cloud.data.tobytes(), dtype=[("xyzi", "<f4", 4), ("label", "<u2")])["label"]
+    assert {1, 5} <= set(labels.tolist()) <= {0, 1, 2, 3, 4, 5}
+
+
+async def drive_until(endpoint: SyntheticEndpoint, time_s: float) -> None:
+    """Turn by turn, so that virtual time goes no further than it has to."""
+    while endpoint.state().time_s < time_s:  # noqa: ASYNC110  virtual time: every turn of the loop moves it
+        await asyncio.sleep(0)
+
+
+@pytest.mark.parametrize("plant", ["unicycle", "mujoco"])
+async def test_commands_come_before_the_plan_and_a_new_one_after_them(
+    plant: Literal["unicycle", "mujoco"], events: Any, clock: Any
+) -> None:
+    if plant == "mujoco":
+        pytest.importorskip("mujoco", reason="the extra sim is not installed")
+    options = SyntheticOptions(topics=("/odometry/filtered",), follow=True, command_timeout_s=0.5, plant=plant)
+    start_ns = clock.wall_ns()
+    endpoint = SyntheticEndpoint(options, clock=clock)
+    await endpoint.start(events)
+    assert set(events.infos) == {"/odometry/filtered", "/plan", "/ground_truth"}
+    rows = subscribe_all(endpoint, events)
+    await drive_until(endpoint, 5.0)
+    assert endpoint.state().travelled_m > 1.5
+    told = len(rows["/plan"])
+    assert told >= 1
+    publisher = endpoint.advertise(topic_info("/cmd_vel", TWIST, Encoding.ROS1))
+    publisher.publish(twist(0.0, 0.0, Encoding.ROS1), 1)
+    await drive_until(endpoint, 5.2)
+    late: list[bytes] = []
+
+    def joined_late(body: bytes, stamp_ns: int) -> bool:
+        late.append(body)
+        return True
+
+    endpoint.subscribe(TopicName("/plan"), joined_late)
+    await drive_until(endpoint, 5.4)
+    assert late == [] and len(rows["/plan"]) == told, "a robot under command has no plan"
+    await drive_until(endpoint, 10.0)
+    await endpoint.stop()
+    assert len(late) == 1 and len(rows["/plan"]) == told + 1
+    plan = ros_types.deserialise(late[0], "nav_msgs/msg/Path", Encoding.ROS1)
+    times_s = [pose.header.stamp.sec - start_ns // 10**9 + pose.header.stamp.nanosec / 1e9 for pose in plan.poses]
+    assert 5.5 <= times_s[0] < 5.6 and times_s[-1] > times_s[0] + 60
+    truth = [ros_types.deserialise(body, "nav_msgs/msg/Odometry", Encoding.ROS1) for body, _ in rows["/ground_truth"]]
+    true = {
+        round(each.header.stamp.sec - start_ns // 10**9 + each.header.stamp.nanosec / 1e9, 2): each for each in truth
+    }
+    stood = true[round(times_s[0], 2)]
+    assert abs(stood.twist.twist.linear.x) < 0.1
+    off_m = [
+        math.dist((at.pose.pose.position.x, at.pose.pose.position.y), (pose.pose.position.x, pose.pose.position.y))
+        for time_s, pose in zip(times_s, plan.poses, strict=True)
+        if (at := true.get(round(time_s, 2)))
+    ]
+    assert len(off_m) >= 8 and max(off_m) < 0.15
+    assert endpoint.state().travelled_m > 3.5
+
+
+def test_only_one_who_follows_tells_the_plan_from_the_truth() -> None:
+    names = set(SyntheticEndpoint(SyntheticOptions(topics=20))._topics)
+    assert not {"/plan", "/ground_truth"} & names and len(names) == 20
+    names = set(SyntheticEndpoint(SyntheticOptions(topics=20, follow=True))._topics)
+    assert {"/plan", "/ground_truth"} < names and len(names) == 22
+
+
+def test_without_mujoco_only_the_unicycle_drives(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(ConfigError, match="install sern\\[sim\\], or take plant unicycle") as caught:
+        SyntheticEndpoint(SyntheticOptions(plant="mujoco"))
+    assert "\n" not in str(caught.value)
+    assert SyntheticEndpoint(SyntheticOptions(plant="unicycle", follow=True)).state().time_s == 0.0
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"plant": "tank"}, "plant 'tank' is not known"),
+        ({"plant": "mujoco", "patrol": True}, "no patrol"),
+        ({"follow": True, "localisation_noise_m": -0.1}, "localisation_noise_m"),
+        ({"follow": True, "localisation_noise_m": math.nan}, "localisation_noise_m"),
+    ],
+)
+def test_options_that_drive_nothing(options: dict[str, Any], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        SyntheticEndpoint(SyntheticOptions(**options))
