@@ -10,11 +10,12 @@ PACKAGES := sern_core sern_runtime sern_relay sern_client sern_sim sern_twin ser
 # quarter less of CPU, and each worker of the tests would rewrite all of them anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup lint format types test wheel compiled test-compiled explore standstills lab bench performance endpoints figures cellular picture demo schemas clean
+.PHONY: help setup lint format types test wheel compiled test-compiled explore standstills lab bench performance endpoints figures cellular picture demo demo-twin schemas clean
 
 help:
 	@echo "make setup    create $(VENV) with pinned dependencies"
 	@echo "make demo     relay, robot and site over a bad link, on this machine, next to plain ZMQ"
+	@echo "make demo-twin  a robot and its twin over a link that is gone for 30 s: how far off it was, and what it said"
 	@echo "make test     the tests but the longer ones of make lab;  make lint, make types: static checks"
 	@echo "make wheel    a wheel in dist/ whose core is compiled;  make test-compiled: the tests of the core and of the daemons on it"
 	@echo "make compiled an environment with that wheel, .venv-compiled, also for benchmarks"
@@ -137,6 +138,9 @@ picture: setup
 
 demo: setup
 	$(BIN)/sern demo
+
+demo-twin: setup
+	$(BIN)/sern demo-twin
 
 schemas: setup
 	$(BIN)/python -m sern_runtime.config.export schemas docs/configuration.md

@@ -207,6 +207,14 @@ class JackalSource:
         found = self._pilot.found
         return found.pose, found.speed_mps, found.yaw_rate_radps
 
+    def thinks(self) -> Pose2:
+        """Where it thinks it is now: what it found last, moved on."""
+        if self._pilot is None:
+            return self.robot.state.pose
+        found = self._pilot.found
+        since_s = self.robot.state.time_s - found.time_s
+        return found.pose.moved(found.speed_mps * since_s, found.yaw_rate_radps * since_s)
+
     def ready(self, plan: Plan) -> bool:
         """Whether the topic has a message now: there is no plan while somebody commands the robot."""
         return plan.name != PLAN.name or (self._pilot is not None and not self._pilot.held)

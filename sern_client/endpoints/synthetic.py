@@ -8,7 +8,7 @@ import asyncio
 import heapq
 import logging
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from random import Random
@@ -25,7 +25,7 @@ from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.entry import end_tasks
 from sern_sim.pilot import OFF_M
-from sern_sim.robot import STEP_S, RobotState
+from sern_sim.robot import STEP_S, Pose2, RobotState
 
 COUNTER_RATE_HZ: Final = 5.0
 HOLD_MESSAGES: Final = 10_000
@@ -257,6 +257,19 @@ class SyntheticEndpoint:
             raise UsageError("an operator has no robot state")
         return self._robot.robot.state
 
+    @property
+    def json_routes(self) -> Mapping[str, Callable[[], object]]:
+        """Of a robot, where it truly is, and where it thinks it is."""
+        robot = self._robot
+        if robot is None:
+            return {}
+
+        def truth() -> object:
+            self._advance(self._clock.monotonic_s() - self._start_s)
+            return {"pose": list(_numbers(robot.robot.state.pose)), "thinks": list(_numbers(robot.thinks()))}
+
+        return {"/api/robot": truth}
+
     def received(self, name: str) -> Received | None:
         """Counts, rate and last body of an advertised topic; None when it was never advertised."""
         return self._received.get(TopicName(name))
@@ -408,6 +421,10 @@ class SyntheticEndpoint:
                 _LOG.warning("%s: command ignored: %s", info.name, error)
             return
         self._commanded_s = self._clock.monotonic_s() - self._start_s
+
+
+def _numbers(pose: Pose2) -> tuple[float, float, float]:
+    return pose.x_m, pose.y_m, pose.yaw_rad
 
 
 def _chosen(topics: int | tuple[str, ...]) -> list[Plan]:
