@@ -28,7 +28,7 @@ DOCUMENTS: Final = {
     **dict.fromkeys(("mmcf", "mmcf_replay", "mmcf_recovery"), THEORY),
     "summaries": ROOT / "docs" / "summaries.md",
     "matrix": ROOT / "docs" / "lab.md",
-    "sync": ROOT / "docs" / "twin.md",
+    **dict.fromkeys(("sync", "sync_lab"), ROOT / "docs" / "twin.md"),
 }
 """The document of each benchmark that has a place in one."""
 IN_README: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
@@ -71,7 +71,7 @@ README_SYSTEMS: Final = {
 """Words for people in a hurry, in place of the names that the other documents explain."""
 YARDSTICKS: Final = frozenset({"forwarder"})
 """Systems that figures are compared with and that nobody would use: not for people in a hurry."""
-TOGETHER: Final = frozenset({"codecs", "footprint", "summaries", "thin_link", "mmcf_replay", "matrix"})
+TOGETHER: Final = frozenset({"codecs", "footprint", "summaries", "thin_link", "mmcf_replay", "matrix", "sync_lab"})
 """Benchmarks whose cases are rows of one table, as far as they have a metric in common."""
 BY_POLICY: Final = frozenset({"mmcf"})
 """Benchmarks whose cases are a mission profile and a trace: a table for each profile, a column for each policy."""

@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Final
 
 from benchmarks import recordings
-from benchmarks.document import DOCUMENT, IN_README, README, insert
+from benchmarks.document import DOCUMENT, DOCUMENTS, IN_README, README, insert
 from sern_client.endpoints.clouds import read_ply
 from sern_core.vocabulary.errors import SernError
 from sern_tools.explain_replay import read_bag
 from sern_tools.lab.backends import choose
 
-STEPS: Final = ("link", "sensors", "robots", "relay", "mmcf_lab")
+STEPS: Final = ("link", "sensors", "robots", "relay", "mmcf_lab", "sync_lab")
 MODULES: Final[Mapping[str, str]] = {"psutil": "bench", "zenoh": "bench", "matplotlib": "report"}
 """The extra that each is in."""
 FOLDERS: Final = ("build", "docs/images")
@@ -33,7 +33,7 @@ def lacking(
     try:
         choose(f"{os.getpid()}")
     except SernError as error:
-        yield f"link, sensors, mmcf_lab: {error}"
+        yield f"link, sensors, mmcf_lab, sync_lab: {error}"
     for module, extra in MODULES.items():
         if importlib.util.find_spec(module) is None:
             yield f"link, sensors, robots, relay: {module} is not installed: pip install '.[{extra}]'"
@@ -50,7 +50,8 @@ def lacking(
     for folder in FOLDERS:
         if not _writable(root / folder):
             yield f"{root / folder}: cannot be written"
-    for path, steps in ((document, STEPS), (readme, [step for step in STEPS if step in IN_README])):
+    here = [step for step in STEPS if DOCUMENTS[step] == DOCUMENT]
+    for path, steps in ((document, here), (readme, [step for step in STEPS if step in IN_README])):
         try:
             text = path.read_text(encoding="utf-8")
             for step in steps:

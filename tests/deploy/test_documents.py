@@ -137,12 +137,12 @@ def test_what_root_starts_is_named_by_its_path() -> None:
 
 
 def test_verbs_exist() -> None:
-    verbs = set(re.findall(r"^(\w+):(?!=)", (ROOT / "Makefile").read_text(), re.M))
+    verbs = set(re.findall(r"^([\w-]+):(?!=)", (ROOT / "Makefile").read_text(), re.M))
     named = {word for _, _, name, rest in typed() if name == "make" for word in rest if "=" not in word}
     named |= {
         word
         for guide in GUIDES
-        for part in re.findall(r"`make ([a-z ]+)`", (ROOT / guide).read_text())
+        for part in re.findall(r"`make ([a-z -]+)`", (ROOT / guide).read_text())
         for word in part.split()
     }
     assert {"demo", "test", "performance", "lab"} <= named <= verbs
