@@ -69,7 +69,7 @@ async def opened(url: str, profile: Path, *, width: int, height: int) -> AsyncIt
     command = browser()
     if command is None:
         raise SernError(f"no {NAMES[0]} on this machine: install it")
-    process = subprocess.Popen(
+    process = subprocess.Popen(  # noqa: ASYNC220  (it takes milliseconds)
         [command, *FLAGS, f"--user-data-dir={profile}", f"--window-size={width},{height}", "about:blank"],
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip

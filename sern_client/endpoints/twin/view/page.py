@@ -125,7 +125,7 @@ def link_html(picture: Picture) -> str:
     when = "now" if picture.ago_s <= 0 else f"<b>{picture.ago_s:.0f} s ago</b>"
     kept = f"kept: {picture.reaches_s:.0f} s"
     link = html.escape(picture.snapshot.link) or "nothing is known of the link"
-    return f'<div style="padding:0 1em">{when} ({kept})<br>link: {link}</div>'
+    return f'<div style="padding:0 1em 0.8em">{when} ({kept})<br>link: {link}</div>'
 
 
 def table_html(snapshot: Snapshot) -> str:

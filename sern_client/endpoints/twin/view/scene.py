@@ -65,9 +65,11 @@ class Drawing:
         self._scene = scene
         self._origin: NDArray[np.float64] | None = None
         self._robots: list[_RobotMarks] = []
+        scene.configure_environment_map(None)
+        scene.add_light_hemisphere("/light/sky", sky_color=(255, 255, 255), ground_color=(190, 190, 190), intensity=1.4)
         scene.add_grid(
             "/ground", infinite_grid=True, cell_size=1.0, section_size=10.0, cell_color=(224, 226, 230),
-            section_color=(186, 190, 198), fade_distance=150.0, shadow_opacity=0.1,
+            section_color=(186, 190, 198), fade_distance=90.0, cell_thickness=0.7, shadow_opacity=0.1,
         )  # fmt: skip
 
     def draw(self, snapshot: Snapshot) -> None:
@@ -133,8 +135,9 @@ class Drawing:
         middle = (points.min(axis=0) + points.max(axis=0)) / 2
         reach_m = max(4.0, float(np.linalg.norm(points - middle, axis=1).max()))
         x_m, y_m = (float(value) for value in middle)
-        away_m = 1.9 * reach_m
-        return Camera((x_m - 0.35 * away_m, y_m - 0.75 * away_m, 0.72 * away_m), (x_m, y_m, 0.0))
+        x_m, y_m = x_m + 0.3 * reach_m, y_m - 0.15 * reach_m  # what stands beside the scene hides its right
+        away_m = 1.4 * reach_m
+        return Camera((x_m - 0.2 * away_m, y_m - 0.85 * away_m, 0.75 * away_m), (x_m, y_m, 0.0))
 
     def _need_origin(self, near: Place) -> NDArray[np.float64]:
         if self._origin is None:
@@ -166,10 +169,10 @@ class _RobotMarks:
                 position=(BODY_M[0] / 2 - NOSE_M[0] / 2, 0.0, BODY_M[2] + 0.05 + NOSE_M[2] / 2), cast_shadow=False,
             )  # fmt: skip
         self._label = scene.add_label(
-            f"{root}/twin/label", "", position=(0.0, 0.0, 1.0), anchor="bottom-center", font_screen_scale=1.2
+            f"{root}/twin/label", "", position=(0.0, 0.0, 1.5), anchor="bottom-center", font_screen_scale=1.2
         )
         self._heard_label = scene.add_label(
-            f"{root}/heard/label", "", position=(0.0, 0.0, 0.8), anchor="bottom-center", font_screen_scale=1.0
+            f"{root}/heard/label", "", position=(0.0, 0.0, 0.9), anchor="bottom-center", font_screen_scale=1.0
         )
         circle = _circle()
         faces = np.array([(0, n + 1, (n + 1) % CIRCLE_CORNERS + 1) for n in range(CIRCLE_CORNERS)], np.uint32)
@@ -185,7 +188,10 @@ class _RobotMarks:
             f"{root}/path", np.zeros((1, 2, 3), np.float32), colour, thickness=4.0, thickness_units="screen"
         )
         self._path_colour = np.array(colour, np.uint8)
-        self._all = (self._twin, self._heard, self._bound, self._edge, self._path)
+        self._gap = scene.add_line_segments(
+            f"{root}/gap", np.zeros((1, 2, 3), np.float32), HEARD_COLOUR, thickness=2.0, thickness_units="screen"
+        )
+        self._all = (self._twin, self._heard, self._bound, self._edge, self._path, self._gap)
         self._level: int | None = None
 
     def hide(self) -> None:
@@ -197,11 +203,13 @@ class _RobotMarks:
         _move(self._twin, shown)
         self._label.text = robot.label
         self._heard.visible = heard is not None
+        self._gap.visible = False
         if heard is not None:
             _move(self._heard, heard)
             apart = math.dist((heard.x_m, heard.y_m), (shown.x_m, shown.y_m)) > APART_M
             self._heard_label.text = f"heard {robot.age_s:.1f} s ago"
-            self._heard_label.visible = apart
+            self._heard_label.visible = self._gap.visible = apart
+            self._gap.points = _line(heard, shown)
         radius_m = max(robot.error_m, LEAST_BOUND_M)
         if robot.level != self._level:
             self._level = robot.level
@@ -236,6 +244,10 @@ def _move(handle: "FrameHandle", place: Place) -> None:
 def _circle() -> NDArray[np.float32]:
     turns = np.linspace(0.0, 2 * math.pi, CIRCLE_CORNERS, endpoint=False)
     return np.column_stack([np.cos(turns), np.sin(turns), np.zeros(CIRCLE_CORNERS)]).astype(np.float32)
+
+
+def _line(start: Place, end: Place) -> NDArray[np.float32]:
+    return np.array([[(place.x_m, place.y_m, place.z_m + _PATH_Z_M) for place in (start, end)]], np.float32)
 
 
 def _segments(path_m: NDArray[np.float32]) -> NDArray[np.float32]:
