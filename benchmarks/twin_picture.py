@@ -58,9 +58,9 @@ def straight(time_s: float) -> Motion:
 class World:
     """The twins of two robots, in time that is made."""
 
-    def __init__(self) -> None:
+    def __init__(self, view: ViewOptions | None = None) -> None:
         self.now = 0.0
-        self.endpoint = TwinEndpoint(TwinOptions(ROBOTS), now=lambda: self.now, wall_ns=lambda: 0)
+        self.endpoint = TwinEndpoint(TwinOptions(ROBOTS, view=view), now=lambda: self.now, wall_ns=lambda: 0)
         self.endpoint.show_link(lambda: LINK)
         self._writer = bodies.Writer(Encoding.CDR)
         self._heard: dict[str, Any] = {}
@@ -96,6 +96,8 @@ class World:
             if self.now <= heard_s:
                 self.pose("jackal1", bend(self.now))
             self.pose("jackal2", straight(self.now))
+            if self.endpoint.view is not None:
+                self.endpoint.view.history.add(self.endpoint.snapshot())
 
 
 def yard() -> tuple[Grid, np.ndarray, np.ndarray]:
