@@ -218,6 +218,11 @@ class TwinEndpoint:
 
     def register_metrics(self, metrics: Metrics) -> None:
         register_twins(metrics, self.robots, self._now)
+        metrics.counter(
+            "sern_twin_view_failures_total",
+            "Times the view of the twins in a browser failed, and went on.",
+            read=lambda: [((), 0.0 if self.view is None else float(self.view.failures))],
+        )
 
     @property
     def json_routes(self) -> Mapping[str, Callable[[], object]]:

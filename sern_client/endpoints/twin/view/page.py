@@ -44,7 +44,7 @@ class Page:
         self.slider = gui.add_slider("seconds ago", 0.0, LENGTH_S, 0.2, 0.0, hint="0: now")
         self._live = gui.add_button("live")
         self._live.on_click(lambda _event: self.live())
-        self._follow = gui.add_dropdown("camera follows", (NOBODY, *robots))
+        self.follow = gui.add_dropdown("camera follows", (NOBODY, *robots))
         self._table = gui.add_html("")
         self._said: dict[str, str] = {}
         self.drawing = Drawing(self._server.scene)
@@ -106,7 +106,7 @@ class Page:
             self._placed.add(number)
             clients[number].camera.position = camera.position
             clients[number].camera.look_at = camera.look_at
-        name = str(self._follow.value)
+        name = str(self.follow.value)
         place = places(snapshot).get(name)
         if place is None:
             self._followed = None

@@ -24,7 +24,10 @@ BLOCKS_S: Final = 1.0
 """How often what stands around is drawn at most, while it changes."""
 AGES_S: Final = 10.0
 """The same while it does not, and only gets older."""
+SHARE: Final = 0.25
+"""Of the time, at most, goes into snapshots and into drawing: of hundreds of robots there are fewer pictures."""
 PAUSE_S: Final = 1.0
+"""After a failure."""
 
 _log = logging.getLogger(__name__)
 
@@ -84,16 +87,18 @@ class TwinView:
                 await asyncio.sleep(PAUSE_S)
 
     async def _record(self) -> None:
-        self.history.add(self._look())
-        await asyncio.sleep(STEP_S)
+        begin_s = self._now()
+        if self.history.due(begin_s):
+            self.history.add(self._look())
+        await asyncio.sleep(pause_s(STEP_S, self._now() - begin_s))
 
     async def _show(self) -> None:
-        await asyncio.sleep(DRAW_S)
-        page = self.page
+        begin_s, page = self._now(), self.page
         if page is None or not page.watched:
-            self._changes = -1
-            return
-        await self.draw(page)
+            self._changes = -1  # for who comes next all of it is drawn at once
+        else:
+            await self.draw(page)
+        await asyncio.sleep(pause_s(DRAW_S, self._now() - begin_s))
 
     async def draw(self, page: "Page") -> None:
         """Draw what the slider asks for, and what stands around where that is due."""
@@ -116,3 +121,8 @@ class TwinView:
         self._changes, self._blocks_due_s, self._ages_due_s = scene.changes, now + BLOCKS_S, now + AGES_S
         grid, cells, ages_s = scene.grid, scene.cells(), scene.ages_s()
         await asyncio.to_thread(lambda: page.blocks(boxes(grid, cells, ages_s)))
+
+
+def pause_s(least_s: float, took_s: float) -> float:
+    """How long to wait after what took so long, so that it takes `SHARE` of the time at most."""
+    return max(least_s, took_s * (1 / SHARE - 1))

@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks.twin_picture import World, yard
 from sern_client.endpoints.twin.options import ViewOptions
 from sern_client.endpoints.twin.view.frames import Box
-from sern_client.endpoints.twin.view.server import AGES_S, BLOCKS_S, TwinView
+from sern_client.endpoints.twin.view.server import AGES_S, BLOCKS_S, DRAW_S, SHARE, TwinView, pause_s
 from sern_twin.world.patches import Cells
 
 
@@ -91,3 +91,8 @@ async def test_what_stands_around_is_drawn_when_it_changes_and_as_it_gets_older(
     world.now += AGES_S
     await view.draw(as_page)
     assert scene.asked == 4, "older by now"
+
+
+def test_the_view_of_many_robots_takes_a_share_of_the_time() -> None:
+    assert pause_s(DRAW_S, 0.0) == pause_s(DRAW_S, 0.01) == DRAW_S
+    assert 0.5 / (0.5 + pause_s(DRAW_S, 0.5)) == SHARE
