@@ -74,9 +74,9 @@ class World:
     def _stamp_ns(self) -> int:
         return round((1000.0 + self.now) * 1e9)
 
-    def pose(self, robot: str, motion: Motion) -> None:
+    def pose(self, robot: str, motion: Motion, *, z_m: float = 0.0, frame_id: str = "map") -> None:
         body = self._writer.odometry(
-            motion, 0.0, z_m=0.0, stamp_ns=self._stamp_ns, frame_id="map", child_frame_id="base_link"
+            motion, 0.0, z_m=z_m, stamp_ns=self._stamp_ns, frame_id=frame_id, child_frame_id="base_link"
         )
         self.say(f"/{robot}/odom", bodies.ODOMETRY, body)
 

@@ -82,21 +82,26 @@ class Snapshot:
         return _SNAPSHOT_BYTES + 4 * len(self.link) + len(self.robots) * _ROBOT_BYTES + texts + paths
 
 
+MOST_FRAME_CHARS: Final = 64
+MOST_HEIGHT_M: Final = 1e5
+"""Heights are passed on as they came, and may be anything."""
 NO_PATH: Final[NDArray[np.float32]] = np.zeros((0, 2), np.float32)
 
 
 def robot_frame(robot: RobotTwin, twin: Twin | None, path: Sequence[Motion], says: str, level: int) -> RobotFrame:
     """`path`: the shown twin from now on; `says`, `level`: its status in words."""
     name, frame = robot.options.name, robot.frame
+    frame_id = frame.frame_id[:MOST_FRAME_CHARS]
+    z_m = frame.z_m if abs(frame.z_m) <= MOST_HEIGHT_M else 0.0
     if twin is None:
-        return RobotFrame(name, frame.frame_id, None, None, NO_PATH, 0.0, 0.0, level, says)
+        return RobotFrame(name, frame_id, None, None, NO_PATH, 0.0, 0.0, level, says)
     shown, heard = twin.shown, robot.last_heard
     path_m = np.array([(step.x_m - shown.x_m, step.y_m - shown.y_m) for step in path], np.float32).reshape(-1, 2)
     return RobotFrame(
         name,
-        frame.frame_id,
-        None if heard is None else _place(heard, frame.z_m),
-        _place(shown, frame.z_m),
+        frame_id,
+        None if heard is None else _place(heard, z_m),
+        _place(shown, z_m),
         path_m,
         twin.error_m,
         twin.age_s,

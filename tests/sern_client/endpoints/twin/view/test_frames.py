@@ -1,9 +1,11 @@
 """What is to be seen of twins at one moment, in time that the test makes."""
 
+import math
+
 import pytest
 
 from benchmarks.twin_picture import LINK, World, bend, straight
-from sern_client.endpoints.twin.view.frames import OK, STALE, WARN, places
+from sern_client.endpoints.twin.view.frames import MOST_FRAME_CHARS, OK, STALE, WARN, places
 
 
 def test_before_a_robot_is_heard_there_is_its_name_alone() -> None:
@@ -46,3 +48,14 @@ def test_a_path_far_from_the_zero_of_its_frame_is_as_fine_as_elsewhere() -> None
     robot = world.endpoint.snapshot().robots[1]
     steps_m = robot.path_m[1:, 0] - robot.path_m[:-1, 0]
     assert steps_m.tolist() == pytest.approx([0.125] * 20, abs=0.002)
+
+
+@pytest.mark.parametrize("z_m", [math.nan, math.inf, -math.inf, 1e300])
+def test_a_height_that_is_none_and_an_endless_name_draw_nothing_strange(z_m: float) -> None:
+    world = World()
+    world.pose("jackal2", straight(0.0), z_m=z_m, frame_id="<b>" * 100_000)
+    robot = world.endpoint.snapshot().robots[1]
+    assert robot.shown is not None and robot.heard is not None
+    assert (robot.shown.z_m, robot.heard.z_m) == (0.0, 0.0)
+    assert len(robot.frame_id) == MOST_FRAME_CHARS
+    assert world.endpoint.snapshot().size_bytes < 3_000

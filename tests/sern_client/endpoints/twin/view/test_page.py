@@ -158,7 +158,7 @@ async def test_a_browser_shows_the_twins_as_they_are_and_were(tmp_path: Path) ->
             assert moved_px > 30, "the twin was elsewhere"
             page.live()
             await seen(tab, lambda each: len(AMBER(each)) > 100, "now again")
-            page.follow.value = "jackal2"
+            page.follow.value = "jackal2"  # type: ignore[misc]
             await seen(tab, lambda each: np.abs(PINK(each).mean(axis=0) - (300, 500)).max() < 60, "it is followed")
         await until(lambda: not page.watched, "the browser has gone", deadline_s=60.0)
     finally:
