@@ -19,7 +19,7 @@ from sern_client.bridge import Bridge
 from sern_client.checks import TableCheck
 from sern_client.client_metrics import Counting, register_client
 from sern_client.connection import Connection
-from sern_client.endpoints.base import BothTold, Endpoint, ObjectEndpoint, ServedEndpoint
+from sern_client.endpoints.base import BothTold, Endpoint, ObjectEndpoint, ServedEndpoint, ShowingEndpoint
 from sern_client.endpoints.composite import with_services
 from sern_client.factory import local_encoding, make_endpoint, make_link_topics
 from sern_client.guard import Guard
@@ -143,6 +143,10 @@ class ClientDaemon:
             reason=self.why,
             parts=self.parts,
         )
+        if isinstance(endpoint, ShowingEndpoint):
+            endpoint.show_link(self.link_words)
+            if self.scene is not None:
+                endpoint.show_scene(self.scene)
         self.check = TableCheck(Tables(self.bridge, self.link_state, self.scene), now=now)
         self.connection = Connection(self.core, model.relay, model.link, on_down=self.link_down)
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
@@ -365,6 +369,13 @@ class ClientDaemon:
         now = clock.now()
         summaries = self.bridge.outbound.summaries.to_json(now)
         return [{**self.core.link.snapshot(), "summaries": summaries, "now_s": now}]
+
+    def link_words(self) -> str:
+        """How the link is, for people: /readyz with the time there and back."""
+        flight = self.core.link.lane.flight
+        rtt = f"; {flight.rtt.srtt_s * 1e3:.0f} ms there and back" if flight.rtt.samples else ""
+        health = self.readiness()
+        return f"{health.reason}{rtt if health.ok else ''}"
 
     def readiness(self) -> Health:
         """What `/readyz` says."""

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar, get_args, get_type_hints
+from typing import TYPE_CHECKING, Final, TypeVar, get_args, get_type_hints
 
 from sern_client.endpoints.base import Endpoint
 from sern_core.vocabulary.errors import ConfigError, UsageError
@@ -14,6 +14,7 @@ from sern_runtime.config.twin import TwinEndpoint
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
+VIEW_PACKAGES: Final = "'sern[viz]'"
 Resolve = Callable[[str], Path]
 Options = TypeVar("Options", bound="DataclassInstance")
 
@@ -80,10 +81,16 @@ def _resolved(value: str | Sequence[str] | None, resolve: Resolve) -> Path | tup
 
 def _twin(section: TwinEndpoint, resolve: Resolve) -> Endpoint:
     from sern_client.endpoints.twin.endpoint import TwinEndpoint
-    from sern_client.endpoints.twin.options import RobotOptions, TwinOptions
+    from sern_client.endpoints.twin.options import RobotOptions, TwinOptions, ViewOptions
 
     robots = tuple(RobotOptions(**robot.model_dump()) for robot in section.robots)
-    return TwinEndpoint(options_of(TwinOptions, section.model_copy(update={"robots": robots}), resolve))
+    view = None
+    if section.view is not None:
+        if not sections.installed("viser"):
+            raise ConfigError(f"needs viser: {sections.installing(VIEW_PACKAGES)}", key="endpoint.view")
+        view = ViewOptions(*section.view.place)
+    options = options_of(TwinOptions, section.model_copy(update={"robots": robots, "view": view}), resolve)
+    return TwinEndpoint(options)
 
 
 def _dds(section: sections.DdsEndpoint, resolve: Resolve) -> Endpoint:

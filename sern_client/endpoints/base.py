@@ -15,7 +15,12 @@ from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import DropReason, Encoding, ObjectKind, TopicName
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from sern_runtime.metrics import Metrics
+    from sern_twin.world.grid import Grid
+    from sern_twin.world.patches import Cells
 
 GUARD_SUFFIX: Final = "_guard"
 """What the node of a client's guard (sern_client/guard.py) has behind the name of the client's own node. It publishes
@@ -221,6 +226,36 @@ class ObjectEndpoint(Protocol):
 
     def use_objects(self, objects: SiteObjects) -> None:
         """Once, before `start`."""
+
+
+class SceneShown(Protocol):
+    """A scene for whoever draws it."""
+
+    @property
+    def grid(self) -> "Grid": ...
+
+    @property
+    def changes(self) -> int:
+        """How often any block has changed: while it is the same, so are the cells."""
+        ...
+
+    def cells(self) -> "Cells":
+        """All layers together, (rows, columns)."""
+        ...
+
+    def ages_s(self) -> "NDArray[np.float64]":
+        """Seconds since each block was changed, (blocks,); NaN: it is as the map of the site has it."""
+        ...
+
+
+@runtime_checkable
+class ShowingEndpoint(Protocol):
+    """An endpoint that may show people what its client knows. Both once, before `start`."""
+
+    def show_link(self, words: Callable[[], str]) -> None:
+        """What says in words how the link is now."""
+
+    def show_scene(self, scene: SceneShown) -> None: ...
 
 
 KeptUpTo = Callable[[int, Mapping[int, DropReason]], None]

@@ -15,6 +15,9 @@ from collections.abc import Callable
 from functools import partial
 from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sern_client.endpoints.base import Held, Publisher, Sink, SiteObjects, Subscription
 from sern_client.endpoints.common.saying import SayOnce
 from sern_client.scene import bodies
@@ -87,6 +90,9 @@ class SceneNode:
         self._subscriptions: dict[TopicName, list[Subscription]] = {}
         self._publishers: dict[TopicName, Publisher] = {}
         self._changed: set[int] = set(range(grid.blocks)) if base is not None else set()
+        self._changed_s: NDArray[np.float64] = np.full(grid.blocks, np.nan)
+        self.changes = 0
+        """How often any block has changed: while it is the same, so are the cells."""
         self._whole_due_s = now()
         self._whole = True
         self._offsets_due_s = now()
@@ -156,12 +162,12 @@ class SceneNode:
         if isinstance(header, Refusal):
             self._said(f"scene: a patch of {item.owner} is not for this grid ({outcome.value})", item.owner, outcome)
         else:
-            self._changed.add(header.key.block)
+            self._change(header.key)
 
     def deleted(self, object_id: str) -> None:
         key = self._key(object_id)
         if key is not None and key.writer != self._client and self.scene.withdraw(key):
-            self._changed.add(key.block)
+            self._change(key)
 
     def _id(self, key: BlockKey) -> str:
         return f"{self._prefix}{key.layer}/{key.block}@{key.writer}"
@@ -200,7 +206,7 @@ class SceneNode:
             self.obstacles.changed = False
             self._paint()
         for key in self.scene.publish():
-            self._changed.add(key.block)
+            self._change(key)
             try:
                 self._objects.put(self._id(key), ObjectKind.PATCH, PATCH_TYPE, value=self.scene.encode_block(key))
             except (RefusedError, UsageError) as error:
@@ -227,6 +233,16 @@ class SceneNode:
             known = over != UNKNOWN
             found[known] = over[known]
         return found
+
+    def ages_s(self) -> NDArray[np.float64]:
+        """Seconds since each block was changed here or from elsewhere, (blocks,); NaN: it is as the map has it."""
+        return self._now() - self._changed_s
+
+    def _change(self, key: BlockKey) -> None:
+        self._changed.add(key.block)
+        if key.layer != "base":
+            self._changed_s[key.block] = self._now()
+        self.changes += 1
 
     def _publish(self, now: float) -> None:
         if self.options.publish is None:

@@ -1,7 +1,9 @@
 """The section of an endpoint of kind `twin`: whose twins to keep, and by what."""
 
+import importlib.util
 from collections import Counter
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Annotated, Final, Literal
 
 from pydantic import Field, model_validator
@@ -9,7 +11,18 @@ from pydantic import Field, model_validator
 from sern_core.topics.patterns import compile_pattern
 from sern_core.topics.rules import Direction, TopicRule
 from sern_core.vocabulary.types import PriorityClass
-from sern_runtime.config.base import ClientText, EndpointBase, Hertz, Section, TopicText, fault
+from sern_runtime.config.base import (
+    ClientText,
+    EndpointBase,
+    FileProblem,
+    Hertz,
+    HttpListen,
+    Section,
+    TopicText,
+    fault,
+    is_local,
+)
+from sern_runtime.config.yaml import Loc
 
 SLOW_PARTS: Final = ("path", "status")
 FAST_PARTS: Final = ("odom", "estimate", "age", "error", "unity")
@@ -34,6 +47,30 @@ class TwinRobot(Section):
     """Silence from here on is a gap, which is reported when it ends."""
 
 
+class TwinView(Section):
+    """The twins in a browser, in three dimensions."""
+
+    listen: HttpListen
+    """`address:port` of this machine's loopback, such as 127.0.0.1:8090. Whoever reaches it sees everything; from
+    elsewhere through an SSH tunnel."""
+
+    @model_validator(mode="after")
+    def _is_for_this_machine(self) -> "TwinView":
+        if not is_local(f"tcp://{self.listen}"):
+            raise fault(
+                f"{self.listen} is open to the network, and the view asks nobody who they are; "
+                "listen on 127.0.0.1 and come through an SSH tunnel (ssh -L)",
+                "listen",
+            )
+        return self
+
+    @property
+    def place(self) -> tuple[str, int]:
+        """Host, without the brackets of IPv6, and port."""
+        host, _, port = self.listen.rpartition(":")
+        return host.strip("[]"), int(port)
+
+
 class TwinEndpoint(EndpointBase):
     """Keeps the twins of robots elsewhere: hears their poses and plans, and publishes where they are by now. Run it
     with sern-twin; it is the only endpoint of its client."""
@@ -56,6 +93,8 @@ class TwinEndpoint(EndpointBase):
     objects: bool = True
     """Also as objects PREFIX/NAME of kind robot, twice a second: the twin to be shown, how old and how far off it may
     be, for whoever subscribes to objects."""
+    view: TwinView | None = None
+    """Also in a browser, in three dimensions; null: not. Needs `pip install 'sern[viz]'`."""
 
     @model_validator(mode="after")
     def _apart(self) -> "TwinEndpoint":
@@ -80,3 +119,8 @@ class TwinEndpoint(EndpointBase):
                     yield TopicRule(compile_pattern(topic), None, priority, Direction.RECEIVE)
         for parts, priority in ((FAST_PARTS, PriorityClass.CONTROL), (SLOW_PARTS, PriorityClass.STATE)):
             yield TopicRule(compile_pattern(f"{self.prefix}/[^/]*/({'|'.join(parts)})"), None, priority, Direction.SEND)
+
+    def file_problems(self, base_dir: Path, loc: Loc) -> Iterator[FileProblem]:
+        if self.view is not None and importlib.util.find_spec("viser") is None:
+            problem = "needs the Python package viser, which is not on this machine: pip install 'sern[viz]'"
+            yield FileProblem((*loc, "view"), problem, warning=True)

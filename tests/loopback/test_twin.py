@@ -1,16 +1,19 @@
 """A robot, a relay, its twin and a site, as daemons: what the site gets is where the robot is."""
 
 import math
+import socket
 import subprocess
 import sys
 from pathlib import Path
 
+import aiohttp
 import pytest
 
 from sern_client.endpoints.synthetic import SyntheticEndpoint
 from sern_client.endpoints.twin.endpoint import TwinEndpoint
 from sern_core.vocabulary.types import TopicName
 from sern_runtime import clock
+from sern_tools.ports import free_ports
 from tests.daemons import Lab, endpoint_of
 from tests.support import until
 
@@ -118,3 +121,49 @@ def test_a_wrong_file_is_one_line(tmp_path: Path, endpoint: str, problem: str) -
     ended = run(config)
     assert ended.returncode == 2 and ended.stdout == ""
     assert len(ended.stderr.splitlines()) == 1 and problem in ended.stderr, ended.stderr
+
+
+async def test_the_twins_are_to_be_seen_with_their_scene_and_the_link(tmp_path: Path) -> None:
+    pytest.importorskip("viser", reason="needs viser: pip install 'sern[viz]'")
+    (port,) = free_ports(1)
+    scene = {"name": "yard", "west_m": -12, "south_m": -12, "width_m": 24, "length_m": 24, "cell_m": 0.2}
+    async with Lab(tmp_path, "twin") as lab:
+        await lab.relay()
+        seen = {**TWIN, "view": {"listen": f"127.0.0.1:{port}"}}
+        twin = await lab.connected(
+            lab.client_file("twin", seen, client={"namespace": "/"}, discovery={"mode": "manual"}, scene=scene)
+        )
+        endpoint: TwinEndpoint = endpoint_of(twin, TwinEndpoint)
+        assert endpoint.view is not None and endpoint.view.scene is twin.scene
+        assert endpoint.snapshot().link.startswith("connected to relay")
+        async with aiohttp.ClientSession() as session, session.get(f"http://127.0.0.1:{port}/") as answer:
+            assert answer.status == 200 and "<html" in (await answer.text()).lower()
+
+
+@pytest.mark.parametrize(
+    ("listen", "problem"),
+    [
+        ("0.0.0.0:8090", "view.listen: 0.0.0.0:8090 is open to the network, and the view asks nobody who they are"),
+        ("[::]:8090", "view.listen: [::]:8090 is open to the network"),
+        ("192.0.2.1:8090", "view.listen: 192.0.2.1:8090 is open to the network"),
+        ("127.0.0.1", "view.listen: '127.0.0.1' is not address:port"),
+        ("127.0.0.1:0", "view.listen: port 0 is not in 1..65535"),
+    ],
+)
+async def test_a_view_for_the_whole_network_is_refused_in_one_line(tmp_path: Path, listen: str, problem: str) -> None:
+    async with Lab(tmp_path, "twin") as lab:
+        process = lab.process(lab.client_file("twin", {**TWIN, "view": {"listen": listen}}))
+        assert await process.ended() == 2
+        await process.said(problem)
+
+
+async def test_a_view_whose_port_is_taken_is_one_line(tmp_path: Path) -> None:
+    pytest.importorskip("viser", reason="needs viser: pip install 'sern[viz]'")
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        listen = f"127.0.0.1:{taken.getsockname()[1]}"
+        async with Lab(tmp_path, "twin") as lab:
+            process = lab.process(lab.client_file("twin", {**TWIN, "view": {"listen": listen}}))
+            assert await process.ended() == 2
+            await process.said("endpoint.view.listen", f"{listen}: Address already in use: choose another address")

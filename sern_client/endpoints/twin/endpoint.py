@@ -19,13 +19,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-from sern_client.endpoints.base import Difference, Held, Sink, SiteObjects, TopicEvents
+from sern_client.endpoints.base import Difference, Held, SceneShown, Sink, SiteObjects, TopicEvents
 from sern_client.endpoints.common.held import HeldSubscription
 from sern_client.endpoints.common.saying import SayOnce, say_failure
 from sern_client.endpoints.twin import bodies
 from sern_client.endpoints.twin.metrics import register_twins
 from sern_client.endpoints.twin.options import TwinOptions
 from sern_client.endpoints.twin.robot import RobotTwin
+from sern_client.endpoints.twin.view.frames import Snapshot, robot_frame
+from sern_client.endpoints.twin.view.server import TwinView
 from sern_core.vocabulary.errors import BodyError, ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.names import plain_type
@@ -33,6 +35,7 @@ from sern_core.vocabulary.types import DropReason, Encoding, ObjectKind, TopicNa
 from sern_runtime import clock, ros_types
 from sern_runtime.entry import end_tasks
 from sern_runtime.metrics import Metrics
+from sern_twin.motion import Motion
 from sern_twin.synchroniser import Twin
 
 _log = logging.getLogger(__name__)
@@ -112,12 +115,25 @@ class TwinEndpoint:
         self._said = SayOnce(_log)
         self._drops: Counter[DropReason] = Counter()
         self._objects: SiteObjects | None = None
+        self._link_words: Callable[[], str] = str
+        self.view: TwinView | None = None
+        if options.view is not None:
+            self.view = TwinView(options.view, tuple(self.robots), self.snapshot, now=now)
         self._task: asyncio.Task[None] | None = None
 
     def use_objects(self, objects: SiteObjects) -> None:
         self._objects = objects
 
+    def show_link(self, words: Callable[[], str]) -> None:
+        self._link_words = words
+
+    def show_scene(self, scene: SceneShown) -> None:
+        if self.view is not None:
+            self.view.scene = scene
+
     async def start(self, events: TopicEvents) -> None:
+        if self.view is not None:
+            await self.view.start()
         for topic in self._topics.values():
             events.topic_added(topic.info)
         self._task = asyncio.create_task(self._run(), name="twins")
@@ -125,6 +141,8 @@ class TwinEndpoint:
 
     async def stop(self) -> None:
         await end_tasks([] if self._task is None else [self._task])
+        if self.view is not None:
+            await self.view.stop()
         for topic in self._topics.values():
             for subscription in list(topic.subscriptions):
                 subscription.close()
@@ -200,6 +218,11 @@ class TwinEndpoint:
 
     def register_metrics(self, metrics: Metrics) -> None:
         register_twins(metrics, self.robots, self._now)
+        metrics.counter(
+            "sern_twin_view_failures_total",
+            "Times the view of the twins in a browser failed, and went on.",
+            read=lambda: [((), 0.0 if self.view is None else float(self.view.failures))],
+        )
 
     @property
     def json_routes(self) -> Mapping[str, Callable[[], object]]:
@@ -274,9 +297,8 @@ class TwinEndpoint:
         if part == "error":
             return self._writer.number(twin.error_m)
         if part == "path":
-            steps = max(1, round(self._options.ahead_s / AHEAD_STEP_S))
-            stamps_ns = [wall_ns + round(number * AHEAD_STEP_S * 1e9) for number in range(steps + 1)]
-            motions = robot.ahead(twin.shown, steps, AHEAD_STEP_S, now=now)
+            motions = self._ahead(robot, twin, now)
+            stamps_ns = [wall_ns + round(number * AHEAD_STEP_S * 1e9) for number in range(len(motions))]
             return self._writer.path(motions, z_m=frame.z_m, stamps_ns=stamps_ns, frame_id=frame.frame_id)
         if part == "unity":
             frame_id = f"unity/{frame.frame_id}"
@@ -285,6 +307,20 @@ class TwinEndpoint:
         return self._writer.odometry(
             motion, twin.error_m, z_m=frame.z_m, stamp_ns=wall_ns, frame_id=frame.frame_id, child_frame_id=child
         )
+
+    def _ahead(self, robot: RobotTwin, twin: Twin, now: float) -> list[Motion]:
+        return robot.ahead(twin.shown, max(1, round(self._options.ahead_s / AHEAD_STEP_S)), AHEAD_STEP_S, now=now)
+
+    def snapshot(self) -> Snapshot:
+        """What is to be seen of the twins now."""
+        now = self._now()
+        robots = []
+        for robot in self.robots.values():
+            twin = robot.twin(now=now)
+            level, says, _values = _words(robot, twin)
+            path = () if twin is None else self._ahead(robot, twin, now)
+            robots.append(robot_frame(robot, twin, path, says, level))
+        return Snapshot(now, tuple(robots), self._link_words())
 
     def to_json(self) -> dict[str, object]:
         """What `/api/twins` says."""

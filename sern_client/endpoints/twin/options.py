@@ -15,6 +15,12 @@ class RobotOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class ViewOptions:
+    host: str
+    port: int
+
+
+@dataclass(frozen=True, slots=True)
 class TwinOptions:
     robots: tuple[RobotOptions, ...]
     encoding: Literal["ros1", "cdr"] = "cdr"
@@ -23,3 +29,4 @@ class TwinOptions:
     prefix: str = "/twin"
     unity: bool = False
     objects: bool = True
+    view: ViewOptions | None = None

@@ -77,6 +77,11 @@ class RobotTwin:
             return "acceleration"
         return "path" if self._path else "trajectory"
 
+    @property
+    def last_heard(self) -> Motion | None:
+        """What the robot said last that was taken."""
+        return self._heard[-1][1] if self._heard else None
+
     def twin(self, *, now: float) -> Twin | None:
         return self._synchroniser.twin(now=now)
 

@@ -1,7 +1,9 @@
 """The configuration sections of the endpoints offer what the endpoints take, with the same defaults."""
 
+import sys
 from dataclasses import MISSING, Field, asdict, fields, is_dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any, get_type_hints
 
 import pytest
@@ -18,6 +20,8 @@ from sern_client.endpoints.synthetic import SyntheticOptions
 from sern_client.endpoints.twin.options import RobotOptions, TwinOptions
 from sern_client.endpoints.zenoh.options import ZenohOptions
 from sern_client.sections import make_section, options_of
+from sern_core.vocabulary.errors import ConfigError
+from sern_runtime.config import endpoints as sections
 from sern_runtime.config.base import EndpointBase
 from sern_runtime.config.endpoints import (
     MAX_SYNTHETIC_TOPICS,
@@ -29,7 +33,7 @@ from sern_runtime.config.endpoints import (
     SyntheticEndpoint,
     ZenohEndpoint,
 )
-from sern_runtime.config.twin import TwinEndpoint, TwinRobot
+from sern_runtime.config.twin import TwinEndpoint, TwinRobot, TwinView
 
 PAIRS = [
     (BagEndpoint, BagOptions),
@@ -95,6 +99,19 @@ def test_every_key_of_a_section_reaches_the_options(section: type[EndpointBase],
 
 def test_as_many_topics_as_the_robot_has() -> None:
     assert len(JACKAL) == MAX_SYNTHETIC_TOPICS
+
+
+@pytest.mark.parametrize(("listen", "place"), [("127.0.0.1:8090", ("127.0.0.1", 8090)), ("[::1]:9", ("::1", 9))])
+def test_the_view_of_a_twin(monkeypatch: pytest.MonkeyPatch, listen: str, place: tuple[str, int]) -> None:
+    robot = TwinRobot(name="jackal1", pose="/jackal1/odom")
+    section = TwinEndpoint(kind="twin", robots=(robot,), view=TwinView(listen=listen))
+    monkeypatch.setitem(sys.modules, "viser", ModuleType("viser"))
+    endpoint: Any = make_section(section, Path)
+    assert endpoint.view is not None
+    assert section.view is not None and section.view.place == place
+    monkeypatch.setattr(sections, "installed", lambda package: False)
+    with pytest.raises(ConfigError, match=r"needs viser: .* -m pip install 'sern\[viz\]'"):
+        make_section(section, Path)
 
 
 def test_robots_of_a_twin() -> None:

@@ -342,3 +342,32 @@ def test_a_lost_patch_is_made_good_by_the_next_of_its_block() -> None:
         told("/scene/yard/x", "site", site.node.scene.encode_block(next(iter(site.node.scene.versions()))))
     )
     assert robot.node.scene.counts[Outcome.OLD] == 1
+
+
+def test_blocks_are_as_old_as_what_was_changed_in_them_last() -> None:
+    """What the map of the site says has no age, there and where it comes to."""
+    air = Air()
+    base = np.full(GRID.shape, UNKNOWN, np.int8)
+    base[0, 0] = OCCUPIED
+    site, robot = Site(air, "site", base=base), Site(air, "robot")
+    for each in (site, robot):
+        each.turn()
+    assert all(np.isnan(each.node.ages_s()).all() for each in (site, robot))
+    assert site.node.changes > 0 and robot.node.cells()[0, 0] == OCCUPIED
+    before = (site.node.changes, robot.node.changes)
+    for each in (site, robot):
+        each.now = 5.0
+    site.marker()
+    for each in (site, robot):
+        each.turn()
+        each.now = 8.0
+    block = int(GRID.block_of(*GRID.index([1.0, 2.0])))
+    for each, changes in zip((site, robot), before, strict=True):
+        assert each.node.changes > changes
+        assert each.node.ages_s()[block] == 3.0 and np.isnan(each.node.ages_s()[0])
+        changes = each.node.changes
+        each.turn()
+        assert each.node.changes == changes, "nothing was changed"
+    site.marker(action=2)
+    site.turn()
+    assert site.node.ages_s()[block] == robot.node.ages_s()[block] == 0.0, "it has gone now"
