@@ -4,6 +4,7 @@ A robot drives a bend by its plan, and was last heard 8 s ago; another one is he
 is the same but for how the browser draws it.
 """
 
+import argparse
 import asyncio
 import io
 import math
@@ -13,13 +14,12 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from PIL import Image
 
 from sern_client.endpoints.twin import bodies
 from sern_client.endpoints.twin.endpoint import TwinEndpoint
 from sern_client.endpoints.twin.options import RobotOptions, TwinOptions, ViewOptions
 from sern_client.endpoints.twin.view.blocks import boxes
-from sern_client.endpoints.twin.view.page import Page, Picture
+from sern_core.vocabulary.errors import SernError
 from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 from sern_tools.harness.browser import opened
@@ -114,6 +114,10 @@ def yard() -> tuple[Grid, np.ndarray, np.ndarray]:
 
 
 async def photograph(out: Path) -> None:
+    from PIL import Image
+
+    from sern_client.endpoints.twin.view.page import Page, Picture
+
     world = World()
     world.play(12.0, SILENT_S)
     page = Page(ViewOptions("127.0.0.1", 0), tuple(world.endpoint.robots))
@@ -136,4 +140,9 @@ async def photograph(out: Path) -> None:
 
 
 if __name__ == "__main__":
-    asyncio.run(photograph(Path(sys.argv[1])))
+    parser = argparse.ArgumentParser(description="Photograph the view of the twins.")
+    parser.add_argument("out", type=Path, help="the PNG to write")
+    try:
+        asyncio.run(photograph(parser.parse_args().out))
+    except (SernError, OSError) as error:
+        sys.exit(f"twin_picture: {error}")

@@ -11,6 +11,7 @@ from sern_runtime.config.client import ClientFile
 from sern_runtime.config.endpoints import installing
 from sern_runtime.config.load import Loaded
 from sern_runtime.config.scene import SceneSection
+from sern_runtime.config.twin import TwinEndpoint
 
 if TYPE_CHECKING:
     from sern_client.scene.node import SceneNode
@@ -50,7 +51,9 @@ def make_scene(
     except UsageError as error:
         raise ConfigError(str(error), file=str(loaded.path), key="scene") from error
     scanners = tuple(ScannerOptions(**each.model_dump()) for each in section.scanners)
-    options = SceneOptions(section.name, scanners, section.obstacles, section.publish)
+    twins_alone = all(isinstance(each, TwinEndpoint) for each in loaded.model.endpoints)  # which take no map
+    publish = None if twins_alone else section.publish
+    options = SceneOptions(section.name, scanners, section.obstacles, publish)
     return SceneNode(
         options,
         grid,

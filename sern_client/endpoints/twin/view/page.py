@@ -3,6 +3,7 @@
 import contextlib
 import html
 import io
+import logging
 import socket
 import threading
 from dataclasses import dataclass
@@ -160,6 +161,7 @@ def _listen(options: ViewOptions) -> ViserServer:
             tried.bind((options.host, options.port))
     except OSError as error:
         raise ConfigError(f"{where}: {error.strerror}: choose another address", key="endpoint.view.listen") from error
+    logging.getLogger("websockets").setLevel(logging.WARNING)  # it says who comes and goes
     with contextlib.redirect_stdout(io.StringIO()):  # viser prints a frame around its address
         server = ViserServer(options.host, options.port, label="sern-twin", verbose=False)
         if options.port not in (0, server.get_port()):
