@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from sern_runtime.metrics import Metrics
     from sern_twin.world.grid import Grid
+    from sern_twin.world.mesh import Mesh
     from sern_twin.world.patches import Cells
 
 GUARD_SUFFIX: Final = "_guard"
@@ -233,6 +234,11 @@ class SceneShown(Protocol):
 
     @property
     def grid(self) -> "Grid": ...
+
+    @property
+    def ground(self) -> "Mesh | None":
+        """The ground and what stands on it; None: it is not known."""
+        ...
 
     @property
     def changes(self) -> int:

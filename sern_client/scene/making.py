@@ -1,7 +1,8 @@
 """Makes the scene of a client from its file. Without the section nothing of it is imported."""
 
 import logging
-from typing import TYPE_CHECKING
+import math
+from typing import TYPE_CHECKING, Final
 
 from sern_client.endpoints.base import Endpoint, SiteObjects
 from sern_client.site import Site
@@ -16,7 +17,12 @@ from sern_runtime.config.twin import TwinEndpoint
 if TYPE_CHECKING:
     from sern_client.scene.node import SceneNode
     from sern_twin.world.grid import Grid
+    from sern_twin.world.mesh import Mesh
     from sern_twin.world.patches import Cells
+    from sern_twin.world.primitives import Primitive
+
+GROUND_CELLS: Final = 200
+"""Of the ground along a side, as it is shown: 80,000 triangles at the most."""
 
 _log = logging.getLogger(__name__)
 
@@ -50,6 +56,7 @@ def make_scene(
         )
     except UsageError as error:
         raise ConfigError(str(error), file=str(loaded.path), key="scene") from error
+    things = _things(loaded, section, grid)
     scanners = tuple(ScannerOptions(**each.model_dump()) for each in section.scanners)
     twins_alone = all(isinstance(each, TwinEndpoint) for each in loaded.model.endpoints)  # which take no map
     publish = None if twins_alone else section.publish
@@ -58,7 +65,8 @@ def make_scene(
         options,
         grid,
         loaded.model.name,
-        base=_base(loaded, section, grid),
+        base=None if things is None else _base(things, grid),
+        ground=_ground(loaded, section, grid, things or []),
         encoding=encoding,
         subscribe=endpoint.subscribe,
         advertise=site.advertise,
@@ -66,8 +74,8 @@ def make_scene(
     )
 
 
-def _base(loaded: Loaded[ClientFile], section: SceneSection, grid: "Grid") -> "Cells | None":
-    """The map of the site on its grid."""
+def _things(loaded: Loaded[ClientFile], section: SceneSection, grid: "Grid") -> "list[Primitive] | None":
+    """What the map of the site has; None: there is no map."""
     if section.base is None or grid.plane is None:
         return None
     from sern_runtime.geodata import read_geojson, read_osm
@@ -75,9 +83,41 @@ def _base(loaded: Loaded[ClientFile], section: SceneSection, grid: "Grid") -> "C
     path = loaded.resolve(section.base)
     geojson = path.name.endswith("json")
     read = read_geojson(path.read_bytes(), str(path)) if geojson else read_osm(path)
-    from sern_twin.world.primitives import base_cells, primitives, rasterised
+    from sern_twin.world.primitives import primitives
 
     made = primitives(read.features, grid.plane)
     left_out = {**read.unread, **{reason.value: count for reason, count in made.unread.items()}}
     _log.info("scene: %d things of %s, left out: %s", len(made.found), path.name, left_out or "nothing")
-    return base_cells(rasterised(made.found, grid))
+    return made.found
+
+
+def _base(things: "list[Primitive]", grid: "Grid") -> "Cells":
+    """The map of the site on its grid."""
+    from sern_twin.world.primitives import base_cells, rasterised
+
+    return base_cells(rasterised(things, grid))
+
+
+def _ground(
+    loaded: Loaded[ClientFile], section: SceneSection, grid: "Grid", things: "list[Primitive]"
+) -> "Mesh | None":
+    """The ground of the site and the buildings on it, to be looked at; None: neither is known."""
+    if section.terrain is None and not things:
+        return None
+    from sern_twin.world.mesh import joined
+    from sern_twin.world.primitives import building_mesh
+
+    if section.terrain is None:
+        return building_mesh(things)
+    from sern_runtime.geodata import read_elevation
+    from sern_twin.world.terrain import resampled
+
+    path = loaded.resolve(section.terrain)
+    try:
+        terrain = resampled(read_elevation(path, near=grid), grid)
+    except UsageError as error:
+        raise ConfigError(str(error), file=str(path)) from error
+    left_out = terrain.resampling
+    _log.info("scene: the ground of %s, %d cells of it outside", path.name, left_out.outside)
+    step = max(1, math.ceil(max(grid.shape) / GROUND_CELLS))
+    return joined([terrain.mesh(step), building_mesh(things, terrain)])

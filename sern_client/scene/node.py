@@ -31,6 +31,7 @@ from sern_core.vocabulary.types import Encoding, ObjectKind, TopicName
 from sern_runtime import clock, ros_types
 from sern_runtime.metrics import Metrics
 from sern_twin.world.grid import Grid
+from sern_twin.world.mesh import Mesh
 from sern_twin.world.occupancy import Occupancy
 from sern_twin.world.offset import object_offset
 from sern_twin.world.patches import LAYERS, OCCUPIED, UNKNOWN, BlockKey, Cells, Refusal, read_header
@@ -62,6 +63,7 @@ class SceneNode:
         client: str,
         *,
         base: Cells | None,
+        ground: Mesh | None = None,
         encoding: Encoding,
         subscribe: Callable[[TopicName, Sink], Subscription],
         advertise: Callable[[TopicInfo], Publisher],
@@ -73,6 +75,8 @@ class SceneNode:
         self.grid = grid
         self.scene = Scene(grid, client, first_version=wall_ns() // 1_000_000)
         self.occupancy = Occupancy(grid)
+        self.ground = ground
+        """The ground and what stands on it, for who looks at it."""
         self.unused: Counter[Unused] = Counter()
         self.offsets_m: dict[str, float] = {}
         """How far what is seen of an obstacle is from where it was added, by its marker."""

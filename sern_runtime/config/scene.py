@@ -61,7 +61,7 @@ class SceneSection(Section):
     frame_id: str = "map"
     """The frame of the grid; poses and obstacles are in it as well."""
     origin: OriginSection | None = None
-    """Where the origin of the frame is on the Earth; needed for `base`."""
+    """Where the origin of the frame is on the Earth; needed for `base` and `terrain`."""
     scanners: Annotated[tuple[ScannerSection, ...], Field(max_length=16)] = ()
     """What sees the scene here."""
     obstacles: TopicText | None = None
@@ -70,6 +70,9 @@ class SceneSection(Section):
     base: PathText | None = None
     """A map of the site that is the ground of the scene: .osm, .osm.pbf or .geojson. Buildings, barriers and water are
     occupied, roads and paths free. One site is enough."""
+    terrain: PathText | None = None
+    """An elevation model of the site, such as a GeoTIFF: the ground on which the page of sern-twin shows it, with the
+    buildings of `base`."""
     publish: TopicText = "/scene/map"
     """Where the map is published here: nav_msgs/OccupancyGrid, and what changes beside it under NAME_updates."""
 
@@ -90,12 +93,13 @@ class SceneSection(Section):
                 "take larger cells, or more block_cells",
                 "cell_m",
             )
-        if self.base is not None and self.origin is None:
-            raise fault("is needed for base: where the frame's origin is on the Earth", "origin")
+        for key in ("base", "terrain"):
+            if getattr(self, key) is not None and self.origin is None:
+                raise fault(f"is needed for {key}: where the frame's origin is on the Earth", "origin")
         return self
 
     def file_problems(self, base_dir: Path, loc: Loc) -> Iterator[FileProblem]:
-        if self.base is not None:
-            path = resolve(base_dir, self.base)
-            if not path.is_file():
-                yield FileProblem((*loc, "base"), f"{path}: no such file")
+        for key in ("base", "terrain"):
+            text = getattr(self, key)
+            if text is not None and not (path := resolve(base_dir, text)).is_file():
+                yield FileProblem((*loc, key), f"{path}: no such file")

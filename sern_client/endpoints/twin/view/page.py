@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 from viser import ViserServer
 
 from sern_client.endpoints.twin.options import ViewOptions
@@ -86,6 +87,11 @@ class Page:
         with self._lock:
             if not self._closed:
                 self.drawing.blocks(boxes)
+
+    def terrain(self, vertices: ArrayLike, faces: ArrayLike) -> None:
+        with self._lock:
+            if not self._closed and len(np.asarray(faces)):
+                self.drawing.terrain(vertices, faces)
 
     def close(self) -> None:
         with self._lock, contextlib.redirect_stdout(io.StringIO()):

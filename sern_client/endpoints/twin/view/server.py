@@ -53,6 +53,7 @@ class TwinView:
         self.scene: SceneShown | None = None
         self._tasks: list[asyncio.Task[None]] = []
         self._said = SayOnce(_log)
+        self._grounded = False
         self._blocks_due_s = 0.0
         self._ages_due_s = 0.0
         self._changes = -1
@@ -116,6 +117,9 @@ class TwinView:
         scene = self.scene
         if scene is None or now < self._blocks_due_s or (scene.changes == self._changes and now < self._ages_due_s):
             return
+        if not self._grounded and scene.ground is not None:
+            await asyncio.to_thread(page.terrain, scene.ground.vertices, scene.ground.faces)
+        self._grounded = True
         from sern_client.endpoints.twin.view.blocks import boxes  # needs what a scene does
 
         self._changes, self._blocks_due_s, self._ages_due_s = scene.changes, now + BLOCKS_S, now + AGES_S

@@ -8,7 +8,9 @@ from benchmarks.twin_picture import World, yard
 from sern_client.endpoints.twin.options import ViewOptions
 from sern_client.endpoints.twin.view.frames import Box
 from sern_client.endpoints.twin.view.server import AGES_S, BLOCKS_S, DRAW_S, SHARE, TwinView, pause_s
+from sern_twin.world.mesh import Mesh
 from sern_twin.world.patches import Cells
+from sern_twin.world.terrain import flat
 
 
 class FakePage:
@@ -18,6 +20,11 @@ class FakePage:
         self.ago_s = 0.0
         self.drawn: list[Any] = []
         self.boxes: list[list[Box]] = []
+        self.grounds: list[int] = []
+
+    def terrain(self, vertices: Any, faces: Any) -> None:
+        assert np.asarray(faces).max() < len(vertices)
+        self.grounds.append(len(faces))
 
     def draw(self, picture: object) -> None:
         self.drawn.append(picture)
@@ -33,6 +40,7 @@ class FakeScene:
         self.grid, self._cells, self._ages_s = yard()
         self.changes = 0
         self.asked = 0
+        self.ground: Mesh | None = flat(self.grid).mesh(step=10)
 
     def cells(self) -> Cells:
         self.asked += 1
@@ -96,3 +104,18 @@ async def test_what_stands_around_is_drawn_when_it_changes_and_as_it_gets_older(
 def test_the_view_of_many_robots_takes_a_share_of_the_time() -> None:
     assert pause_s(DRAW_S, 0.0) == pause_s(DRAW_S, 0.01) == DRAW_S
     assert 0.5 / (0.5 + pause_s(DRAW_S, 0.5)) == SHARE
+
+
+async def test_the_ground_is_drawn_once() -> None:
+    world = World()
+    view, page, as_page = made(world)
+    view.scene = FakeScene()
+    for step in range(5):
+        world.now = 20.0 * step
+        await view.draw(as_page)
+    assert page.grounds == [len(FakeScene().ground.faces)]  # type: ignore[union-attr]
+    view, page, as_page = made(world)
+    view.scene = scene = FakeScene()
+    scene.ground = None
+    await view.draw(as_page)
+    assert page.grounds == [] and len(page.boxes) == 1
