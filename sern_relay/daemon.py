@@ -62,8 +62,8 @@ PATIENCE_S: Final = 5.0
 SWEEP_S: Final = 1.0
 OTHER_CODE: Final = "other"
 REFUSAL_CODES: Final = frozenset({
-    "bad_announcement", "bad_id", "bad_name", "bad_pattern", "displaced", "forbidden", "internal_error", "name_taken",
-    "not_owner", "old_boot", "origin", "registry_full", "too_large", "too_many_objects",
+    "bad_announcement", "bad_id", "bad_name", "bad_object", "bad_pattern", "displaced", "forbidden",
+    "internal_error", "name_taken", "not_owner", "old_boot", "origin", "registry_full", "too_large", "too_many_objects",
     "too_many_patterns", "too_many_streams", "type_mismatch",
 })  # fmt: skip
 """What a refusal is counted under; a code that a client made up is counted as `other`."""

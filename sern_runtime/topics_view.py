@@ -6,6 +6,7 @@ from typing import Any
 
 from sern_core.link.link import Link
 from sern_core.link.view import CodecView
+from sern_core.objects.changes import OBJECTS_TOPIC
 from sern_core.vocabulary.ledger import ReceiveLedger
 from sern_core.vocabulary.message import StreamInfo
 from sern_core.vocabulary.types import CLASS_LABELS
@@ -22,6 +23,8 @@ def link_summary(link: Link, *, direction: str) -> dict[str, TopicView]:
     wanted = {view.stream.id.topic for view in views if view.wanted}
     result: dict[str, TopicView] = {}
     for topic, counters in link.counters.items():
+        if topic == OBJECTS_TOPIC:
+            continue  # is nobody's topic; the metrics have it
         in_queue, in_flight = held.get(topic, (0, 0))
         result[topic] = {
             "class": CLASS_LABELS[counters.priority],

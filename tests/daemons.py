@@ -24,7 +24,8 @@ from rosbags.typesys import Stores, get_typestore
 from sern_client.action_conversion.endpoint import ActionEndpoint
 from sern_client.daemon import ClientDaemon
 from sern_client.endpoints.base import Endpoint
-from sern_core.vocabulary.types import ClientName
+from sern_core.objects.changes import OBJECTS_TOPIC
+from sern_core.vocabulary.types import ClientName, TopicName
 from sern_relay.daemon import RelayDaemon
 from sern_runtime.config.client import load_client
 from sern_runtime.config.keys import SecretKey
@@ -331,6 +332,11 @@ def endpoint_of(daemon: ClientDaemon, kind: type[Any]) -> Any:
         endpoint = endpoint.inner
     assert isinstance(endpoint, kind)
     return cast("Any", endpoint)
+
+
+def topics_out(daemon: ClientDaemon) -> list[TopicName]:
+    """The topics of the streams that a client has for its relay; that of its objects is none."""
+    return [stream.topic for stream in daemon.core.link.outgoing.by_stream if stream.topic != OBJECTS_TOPIC]
 
 
 def delivered(site: ClientDaemon | Process, topic: str | None = None) -> int:

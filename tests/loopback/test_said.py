@@ -18,7 +18,7 @@ from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import clock
 from sern_runtime.transport_watch import WAITING
 from sern_runtime.zmq_setup import make_client
-from tests.daemons import Lab, write_bag
+from tests.daemons import Lab, topics_out, write_bag
 from tests.loopback.test_http_api import get
 from tests.support import until
 
@@ -100,7 +100,7 @@ async def test_two_processes_with_one_name_are_told_of_each_other(
         # One line for each time that it is displaced, and one at the relay.
         await lab.end(second)
         await until(lambda: first.readiness().ok, "goes on alone")
-        await until(lambda: len(relay.hub.relayed) == len(first.core.link.sender.channels) > 0, "has its topics again")
+        await until(lambda: len(relay.hub.relayed) == len(topics_out(first)) > 0, "has its topics again")
         assert first.bridge.outbound.refusals == 0
         own = [record for record in caplog.records if said in record.getMessage()]
         assert {record.name for record in own} == {"sern_client.link_news", "sern_relay.daemon"}

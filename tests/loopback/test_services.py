@@ -21,7 +21,7 @@ from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInf
 from sern_core.vocabulary.types import ClientName, DropReason, Encoding, Reliability, TopicName
 from sern_runtime import clock
 from sern_runtime.config.client import load_client
-from tests.daemons import Lab
+from tests.daemons import Lab, topics_out
 from tests.fake_services import Services
 from tests.support import until
 
@@ -274,9 +274,7 @@ async def test_only_what_a_rule_names_is_offered_and_used(tmp_path: Path, monkey
         handler = await sites.served()
         assert await handler(b"") == b"re: "
         expected = {"/robot1/set_speed/_service", "/robot1/set_mode/_service", "/robot1/set_mode/_reply/site"}
-        await until(
-            lambda: {stream.topic for stream in robot.core.link.outgoing.by_stream} == expected, "offered and answered"
-        )
+        await until(lambda: set(topics_out(robot)) == expected, "offered and answered")
         assert list(sites.site.served) == [GLOBAL]
 
 
@@ -313,7 +311,7 @@ async def test_nobody_calls_in_the_name_of_another_site(tmp_path: Path, monkeypa
         rogue.core.send(own, CALL.pack(2) + b"own", 0, now=clock.now())
         await until(lambda: (SERVICE, b"own") in sites.robot.calls, "its own call is executed")
         assert (SERVICE, b"forged") not in sites.robot.calls
-        assert [stream.topic for stream in robot.core.link.outgoing.by_stream] == [
+        assert topics_out(robot) == [
             "/robot1/set_mode/_service",
             "/robot1/set_mode/_reply/rogue",
         ]
@@ -473,7 +471,7 @@ async def test_services_that_come_and_go_leave_nothing_behind(tmp_path: Path, mo
             sites.robot.events.service_removed(SERVICE)
             await until(lambda: not sites.site.served, "withdrawn")
         await until(
-            lambda: not robot.core.link.outgoing.by_stream and not site.core.link.outgoing.by_stream,
+            lambda: not topics_out(robot) and not topics_out(site),
             "no streams are left",
         )
         for services in (bridge(robot), bridge(site)):
@@ -495,10 +493,10 @@ async def test_many_services_cost_a_stream_each_until_they_are_called(
         for number in range(count):
             sites.robot.events.service_added(replace(INFO, name=TopicName(f"/set_{number}")))
         await until(lambda: len(sites.site.served) == count, "all are served")
-        assert (len(robot.core.link.outgoing.by_stream), len(site.core.link.outgoing.by_stream)) == (count, 0)
+        assert (len(topics_out(robot)), len(topics_out(site))) == (count, 0)
         handler = sites.site.served[TopicName("/robot1/set_7")].handler
         assert await handler(b"seven") == b"re: seven"
-        assert (len(robot.core.link.outgoing.by_stream), len(site.core.link.outgoing.by_stream)) == (count + 1, 1)
+        assert (len(topics_out(robot)), len(topics_out(site))) == (count + 1, 1)
 
 
 async def test_a_site_serves_only_so_many(
