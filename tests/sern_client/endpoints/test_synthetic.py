@@ -392,6 +392,7 @@ def test_on_hills_its_messages_have_height_and_tilt_and_its_clouds_labels() -> N
         assert up == pytest.approx(math.cos(state.roll_rad) * math.cos(state.pitch_rad))
         assert 2 * (turned.w * turned.y - turned.z * turned.x) == pytest.approx(math.sin(state.pitch_rad))
         assert (pose.orientation.x, pose.orientation.y) == (turned.x, turned.y)
+        assert read(source, next(plan for plan in JACKAL if plan.name == "/pose")).pose == pose
         tilted = max(tilted, abs(state.pitch_rad))
     assert tilted > 0.01
     cloud = read(source, next(plan for plan in JACKAL if plan.name == "/points"))
