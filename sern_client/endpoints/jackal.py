@@ -438,7 +438,9 @@ class JackalSource:
         return self._new("diagnostic_msgs/msg/DiagnosticArray", header=header, status=[status])
 
     def _pose(self, stamp_ns: int, seq: int) -> Any:
-        return self._stamped_pose(stamp_ns, seq, self.robot.state.pose)
+        header = self._header(stamp_ns, "odom", seq)
+        pose = self._pose_on_ground(self.robot.state.pose)
+        return self._new("geometry_msgs/msg/PoseStamped", header=header, pose=pose)
 
     def _fix(self, stamp_ns: int, seq: int) -> Any:
         pose, (latitude, longitude) = self.robot.state.pose, ORIGIN_DEG

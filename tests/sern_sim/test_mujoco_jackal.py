@@ -19,8 +19,14 @@ CELLS = 41
 
 
 @pytest.fixture(autouse=True)
-def _needs_mujoco() -> None:
-    pytest.importorskip("mujoco", reason="the extra sim is not installed")
+def _needs_mujoco(request: pytest.FixtureRequest) -> None:
+    if "without_mujoco" not in request.fixturenames:
+        pytest.importorskip("mujoco", reason="the extra sim is not installed")
+
+
+@pytest.fixture
+def without_mujoco(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mujoco", None)
 
 
 def level(*blocks: Block) -> Terrain:
@@ -225,8 +231,8 @@ def test_it_stays_within_centimetres_of_its_plan_on_hills(seed: int) -> None:
     assert robot.state.travelled_m > 30
 
 
-def test_without_mujoco_the_error_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "mujoco", None)
+@pytest.mark.usefixtures("without_mujoco")
+def test_without_mujoco_the_error_says_what_to_do() -> None:
     for make in (load_mujoco, lambda: MujocoJackal(Random(1))):
         with pytest.raises(ConfigError) as caught:
             make()

@@ -268,6 +268,12 @@ ENDPOINT = "endpoint: {kind: synthetic, role: robot}\n"
             "3: endpoint.kind: needs the Python package rclpy, which is not on this machine: "
             f"{ros_installation.remedy()}",
         ),
+        (
+            "endpoint: {kind: synthetic, role: robot, plant: mujoco}\n",
+            "3: endpoint.plant: needs the Python package mujoco, which is not on this machine: "
+            f"{sys.executable} -m pip install mujoco",
+        ),
+        ("endpoint: {kind: synthetic, role: robot, plant: unicycle}\n", ""),
     ],
 )
 def test_what_is_accepted_and_does_not_do_what_it_seems(

@@ -3,6 +3,7 @@
 import asyncio
 import logging
 import math
+import subprocess
 import sys
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -392,6 +393,7 @@ def test_on_hills_its_messages_have_height_and_tilt_and_its_clouds_labels() -> N
         assert up == pytest.approx(math.cos(state.roll_rad) * math.cos(state.pitch_rad))
         assert 2 * (turned.w * turned.y - turned.z * turned.x) == pytest.approx(math.sin(state.pitch_rad))
         assert (pose.orientation.x, pose.orientation.y) == (turned.x, turned.y)
+        assert read(source, next(plan for plan in JACKAL if plan.name == "/pose")).pose == pose
         tilted = max(tilted, abs(state.pitch_rad))
     assert tilted > 0.01
     cloud = read(source, next(plan for plan in JACKAL if plan.name == "/points"))
@@ -472,6 +474,20 @@ def test_without_mujoco_only_the_unicycle_drives(monkeypatch: pytest.MonkeyPatch
         SyntheticEndpoint(SyntheticOptions(plant="mujoco"))
     assert "\n" not in str(caught.value)
     assert SyntheticEndpoint(SyntheticOptions(plant="unicycle", follow=True)).state().time_s == 0.0
+
+
+def test_a_client_without_mujoco_ends_with_one_line(tmp_path: Path) -> None:
+    config = tmp_path / "client.yaml"
+    config.write_text(
+        "client: {name: jackal1}\nrelay: {endpoint: 'tcp://127.0.0.1:5555', insecure: true}\n"
+        "endpoint: {kind: synthetic, role: robot, plant: mujoco}\n"
+    )
+    script = "import sys; sys.modules['mujoco'] = None; from sern_client.cli import main; main()"
+    command = [sys.executable, "-c", script, "--config", str(config)]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    said = ended.stderr.splitlines()
+    assert ended.returncode == 2 and len(said) == 1, ended.stderr
+    assert said[0].startswith("sern-client: plant mujoco needs the package mujoco")
 
 
 @pytest.mark.parametrize(
