@@ -24,11 +24,12 @@ CORE = [
     for name in (
         "wire/announce.py",
         "link/answers.py",
-        "site/client.py", "site/subscription.py", "site/own_objects.py",
+        "site/client.py", "site/subscription.py", "site/object_mirror.py",
         "link/streams_in.py",
         "link/streams_out.py",
         "relay/hub.py",
         "relay/hub_port.py",
+        "relay/object_exchange.py",
         "relay/relayed_streams.py",
         "link/session.py",
         "link/control_reader.py",
