@@ -21,6 +21,12 @@ LARGE_BLOCK_BYTES: Final = 200_000
 
 @pytest.mark.parametrize("reliable", [False, True])
 def test_a_channel_on_which_nothing_was_sent_is_small(reliable: bool) -> None:
+    """Of two measurements the lesser: a smaller table of the process may grow in one, not in both."""
+    assert min(channel_bytes(reliable=reliable) for _ in range(2)) <= MAX_CHANNEL_BYTES
+
+
+def channel_bytes(*, reliable: bool) -> float:
+    """What is held for each channel, the tables of the process left out."""
     world = World()
     peer = Hostile(world)
     for number in range(SUBSCRIBERS):
@@ -39,8 +45,8 @@ def test_a_channel_on_which_nothing_was_sent_is_small(reliable: bool) -> None:
         tracemalloc.stop()
     channels = sum(len(relayed.outs) for relayed in world.relay.hub.relayed.values())
     assert channels == (STREAMS + 1) * SUBSCRIBERS
-    assert sum(size for size in sizes if size < LARGE_BLOCK_BYTES) / (STREAMS * SUBSCRIBERS) <= MAX_CHANNEL_BYTES
     assert sum(size >= LARGE_BLOCK_BYTES for size in sizes) <= 1
+    return sum(size for size in sizes if size < LARGE_BLOCK_BYTES) / (STREAMS * SUBSCRIBERS)
 
 
 def test_topics_share_the_counts_of_drops_until_they_drop_something() -> None:
