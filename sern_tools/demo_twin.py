@@ -27,6 +27,7 @@ from rich.console import Console
 from sern_core.vocabulary.errors import SernError
 from sern_runtime.profiles import load_profile
 from sern_sim.profiles import LinkProfile
+from sern_sim.robot import Pose2
 from sern_tools import demo_twin_report as reporting
 from sern_tools.demo_link import LinkProcess
 from sern_tools.demo_scenario import FAR_HOST, HOST
@@ -121,8 +122,8 @@ class Look:
             return None
         return Sample(
             at_s,
-            tuple(truth["pose"]),
-            tuple(truth["thinks"]),
+            _at(truth, "pose", twin["now_s"]),
+            _at(truth, "thinks", twin["now_s"]),
             tuple(twin["pose"]),
             twin["age_s"],
             twin["error_m"],
@@ -131,6 +132,13 @@ class Look:
             twin["goes_by"],
             twin["says"],
         )
+
+
+def _at(truth: Any, place: str, now_s: float) -> tuple[float, float, float]:
+    """Where the robot is, or thinks it is, at the moment of the twin: they do not answer at the same time."""
+    since_s = now_s - truth["now_s"]
+    moved = Pose2(*truth[place]).moved(truth["speed_mps"] * since_s, truth["yaw_rate_radps"] * since_s)
+    return moved.x_m, moved.y_m, moved.yaw_rad
 
 
 async def _get(session: aiohttp.ClientSession, url: str) -> Any:

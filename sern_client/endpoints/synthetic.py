@@ -22,7 +22,7 @@ from sern_client.endpoints.jackal import JACKAL, PLAN, TRUTH, JackalSource, Oper
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding, TopicName
-from sern_runtime import ros_types
+from sern_runtime import clock, ros_types
 from sern_runtime.entry import end_tasks
 from sern_sim.pilot import OFF_M
 from sern_sim.robot import STEP_S, Pose2, RobotState
@@ -259,14 +259,21 @@ class SyntheticEndpoint:
 
     @property
     def json_routes(self) -> Mapping[str, Callable[[], object]]:
-        """Of a robot, where it truly is, and where it thinks it is."""
+        """Of a robot, where it truly is, where it thinks it is, and when (`now_s`, seconds of this machine's clock)."""
         robot = self._robot
         if robot is None:
             return {}
 
         def truth() -> object:
             self._advance(self._clock.monotonic_s() - self._start_s)
-            return {"pose": list(_numbers(robot.robot.state.pose)), "thinks": list(_numbers(robot.thinks()))}
+            state = robot.robot.state
+            return {
+                "pose": list(_numbers(state.pose)),
+                "thinks": list(_numbers(robot.thinks())),
+                "speed_mps": state.speed_mps,
+                "yaw_rate_radps": state.yaw_rate_radps,
+                "now_s": clock.now() - (self._clock.monotonic_s() - self._start_s - state.time_s),
+            }
 
         return {"/api/robot": truth}
 

@@ -29,7 +29,7 @@ async def test_it_says_how_far_off_the_twin_was(tmp_path: Path) -> None:
     said, wrong = process.communicate()
     assert process.returncode in (0, 1), said + wrong  # a promise may break on a machine that stands still
     told = json.loads((tmp_path / "out" / "twin.json").read_text())
-    assert len(told["promises"]) == 7 and len(told["samples"]) > 10
+    assert len(told["promises"]) == 8 and len(told["samples"]) > 10
     assert told["blackouts_s"] == [[2.0, 5.0]]
     assert any(sample["goes_by"] == "trajectory" for sample in told["samples"])
     assert "further off than it said" in (tmp_path / "out" / "twin.html").read_text()

@@ -32,14 +32,14 @@ def verdicts(report: TwinReport) -> dict[str, bool]:
 
 def test_a_twin_that_stays_with_its_robot_keeps_every_promise() -> None:
     report = judged(samples(), GONE, 12.0, "sern demo-twin")
-    assert report.ok and len(report.verdicts) == 7
+    assert report.ok and len(report.verdicts) == 8
     assert max(report.unhelped_m) == pytest.approx(5.9, abs=0.05)
     assert min(report.unhelped_m) == pytest.approx(0.1, abs=0.11)
 
 
 STEADY, MEDIAN, P95 = "while the link is there, p95", "after 6 s: off, median", "after 6 s: off, p95"
 BACK, HEARD, SNAPS = "back within 5 cm after the return", "gone for 6 s: nothing was heard for", "snaps"
-BOUND = "further off than it said, of where the robot thinks it is"
+UNHEARD, BOUND = "unheard, further off than it said", "heard, further off than it said"
 
 
 def last(*, snaps: int = 0, violated: int = 0) -> list[Sample]:
@@ -54,9 +54,10 @@ def last(*, snaps: int = 0, violated: int = 0) -> list[Sample]:
         (samples(gap_off_m=0.06), {MEDIAN}),
         (samples(gap_off_m=0.08), {MEDIAN, P95}),
         (samples(bound_m=-0.2), {BOUND}),
+        (samples(bound_m=-6.5), {BOUND, UNHEARD}),
         ([each._replace(age_s=0.1) for each in samples()], {HEARD}),
         (last(snaps=1), {SNAPS}),
-        (last(violated=1), {BOUND}),
+        (last(violated=1), {UNHEARD}),
         (samples()[:75], {BACK}),
     ],
 )

@@ -335,6 +335,7 @@ class TwinEndpoint:
                 "level": level,
                 "pose": None if shown is None else [shown.x_m, shown.y_m, shown.yaw_rad],
                 "frame_id": robot.frame.frame_id,
+                "now_s": now,
                 "age_s": None if twin is None else twin.age_s,
                 "error_m": None if twin is None else twin.error_m,
                 **dict(values),
