@@ -65,6 +65,8 @@ def register_relay(metrics: Metrics, relay: Counting) -> None:
                     lambda: [((outcome,), float(n)) for outcome, n in hub.exchange.counts.items()])  # fmt: skip
     metrics.gauge("sern_object_feeds", "Clients that subscribe to objects.",
                   read=lambda: [((), float(len(hub.exchange.feeds)))])  # fmt: skip
+    metrics.gauge("sern_objects_untold", "Objects that subscribers were not told of: their texts fit into no message.",
+                  read=lambda: [((), float(sum(feed.untold for feed in hub.exchange.feeds.values())))])  # fmt: skip
     metrics.counter("sern_relay_refusals_total", "Announcements, subscriptions and objects refused, by code.",
                     ("code",), lambda: [((code,), float(n)) for code, n in relay.refusals.items()])  # fmt: skip
     metrics.counter("sern_bad_frames_total", "Frames that were not valid; their connections were closed.",

@@ -11,7 +11,6 @@ from typing import Final
 from sern_core.link.link import Link
 from sern_core.objects.changes import (
     Begin,
-    Change,
     Define,
     Delete,
     End,
@@ -19,10 +18,10 @@ from sern_core.objects.changes import (
     object_stream,
     put_of,
     set_of,
-    text_hash,
 )
 from sern_core.objects.registry import ObjectRegistry
 from sern_core.objects.xr_object import XrObject
+from sern_core.vocabulary.errors import UsageError
 from sern_core.vocabulary.message import Message
 from sern_core.vocabulary.types import ObjectKind
 
@@ -51,7 +50,7 @@ Sees = Callable[[str, ObjectKind | None], bool]
 
 class ObjectFeed:
     """`sees` and `kinds` say what it is about; to change them, set both and call `restart`. `text_of` gives the text of
-    an object's definition, empty where there is none."""
+    an object's definition, empty where there is none. `untold` counts objects whose texts fit into no message."""
 
     def __init__(
         self,
@@ -70,6 +69,7 @@ class ObjectFeed:
         self.kinds = kinds
         self._text_of = text_of
         self.channel = link.outgoing.open(object_stream(link.end.name, link.end.boot), first=first, now=now)
+        self.untold = 0
         self.idle = False
         """Nobody is to be told anything."""
         self._pending: dict[str, None] = {}
@@ -121,14 +121,14 @@ class ObjectFeed:
             looks -= 1
             if not self._began:
                 self._began = True
-                self._say(Begin(self._registry.epoch, not self._unsure), now)
+                self._say(encode(Begin(self._registry.epoch, not self._unsure)), now)
             elif self._pending:
                 object_id = next(iter(self._pending))
                 del self._pending[object_id]
                 self._tell(object_id, now)
             elif self._open:
                 self._open = False
-                self._say(End(self._version), now)
+                self._say(encode(End(self._version)), now)
             else:
                 return
         if not self._room():
@@ -159,7 +159,7 @@ class ObjectFeed:
         if about is None or not self.sees(object_id, about[0]):
             known = self._told.pop(object_id, None) is not None
             if known or (about is None and self._unsure and self.sees(object_id, None)):
-                self._say(Delete(object_id, upto), now)
+                self._say(encode(Delete(object_id, upto)), now)
                 self._open = bool(self._pending)
             return
         item = self._registry.get(object_id)
@@ -167,19 +167,24 @@ class ObjectFeed:
         if item is None or known_version == item.version:
             return
         text = self._text_of(item)
-        named = text_hash(text)
+        put = put_of(item, text, upto=upto)
+        try:
+            whole = encode(put)
+        except UsageError:
+            self.untold += 1  # of this object alone: the others go on
+            return
+        named = put.text_hash
         if text and named not in self._texts:
             self._texts.add(named)
-            self._say(Define(named, text), now)
-        put = put_of(item, text, upto=upto)
+            self._say(encode(Define(named, text)), now)
         texts = hash((put[:6], tuple(put.attributes.items())))
         self._told[object_id] = item.version, texts
-        self._say(set_of(put) if known_version and known_texts == texts else put, now)
+        self._say(encode(set_of(put)) if known_version and known_texts == texts else whole, now)
         self._open = bool(self._pending)
 
-    def _say(self, change: Change, now: float) -> None:
+    def _say(self, body: bytes, now: float) -> None:
         channel = self.channel
-        message = Message(channel.stream.id, channel.next_seq, encode(change), 0, now)
+        message = Message(channel.stream.id, channel.next_seq, body, 0, now)
         self._link.sender.submit(channel, message, now=now, forced=True)
 
     def _room(self) -> bool:

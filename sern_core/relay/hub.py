@@ -134,6 +134,7 @@ class Hub:
             access=lambda: clients.access,
             text_of=self._text_of,
             refused=self.events.refused,
+            attempt=clients.attempt,
         )
         self.absent = AbsentClients(clients, streams, self.routing, self.events, known, link.limits)
 
@@ -210,8 +211,7 @@ class Hub:
 
     def tell_objects(self, *, now: float) -> None:
         """Tell clients what has changed of the objects that they subscribe to. Call ten times a second."""
-        for client, feed in list(self.exchange.feeds.items()):
-            self.clients.attempt(client, now, partial(feed.pump, now=now))
+        self.exchange.pump(now=now)
         self.after()
 
     def lapse(self, *, now: float) -> bool:

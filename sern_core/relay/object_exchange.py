@@ -8,6 +8,7 @@ who may subscribe to it is told of it; `node:NAME` is told to who may subscribe 
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Final, NamedTuple
 
 from sern_core.link.link import Link
@@ -21,6 +22,7 @@ from sern_core.objects.changes import (
     Put,
     Set,
     decode,
+    encode,
     put_of,
     text_hash,
 )
@@ -31,7 +33,7 @@ from sern_core.relay.access import AccessTable
 from sern_core.stream.in_stream import InStream
 from sern_core.stream.out_channel import OutChannel
 from sern_core.topics.patterns import Pattern, PatternError, compile_pattern
-from sern_core.vocabulary.errors import RefusedError, WireError
+from sern_core.vocabulary.errors import RefusedError, UsageError, WireError
 from sern_core.vocabulary.message import Message
 from sern_core.vocabulary.types import ClientName, ObjectKind, TopicName
 from sern_core.wire import framing
@@ -97,7 +99,7 @@ class _Owner:
 
 class ObjectExchange:
     """`access` are the rules of now; `text_of` gives the text of an object's definition; `refused(client, code, text)`
-    is told what is not taken."""
+    is told what is not taken; `attempt` does something about a client so that its failure is that client's."""
 
     def __init__(
         self,
@@ -107,7 +109,9 @@ class ObjectExchange:
         access: Callable[[], AccessTable],
         text_of: Callable[[XrObject], str],
         refused: Callable[[ClientName, str, str], None],
+        attempt: Callable[[ClientName, float, Callable[[], object]], None],
     ) -> None:
+        self._attempt = attempt
         self._registry = registry
         self._links = links
         self._access = access
@@ -187,6 +191,10 @@ class ObjectExchange:
         about = self._registry.about(change.object_id)
         if about is not None and about[2] is not None:
             raise RefusedError("not_owner", f"{client} may not put {change.object_id[:80]}: it stands for a topic")
+        try:
+            encode(change._replace(owner=client, upto=2**62))  # as it is told to others
+        except UsageError as error:
+            raise RefusedError("too_large", f"{client} may not put {change.object_id[:80]}: {error}") from error
         self._registry.put(
             change.object_id,
             owner=client,
@@ -284,8 +292,8 @@ class ObjectExchange:
 
     def pump(self, *, now: float) -> None:
         """Tell those who subscribe what is due. Call ten times a second."""
-        for feed in self.feeds.values():
-            feed.pump(now=now)
+        for client, feed in list(self.feeds.items()):
+            self._attempt(client, now, partial(feed.pump, now=now))
 
     def revoke(self) -> None:
         """There are new access rules: everyone is told anew what it may have, and forgets what it may not."""

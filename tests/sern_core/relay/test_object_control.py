@@ -8,9 +8,10 @@ from sern_core.objects.changes import OBJECTS_TOPIC
 from sern_core.objects.registry import ObjectRegistry
 from sern_core.relay.access import AccessRule, AccessTable
 from sern_core.relay.object_exchange import name_of
+from sern_core.site.object_mirror import Selection
 from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo
-from sern_core.vocabulary.types import ClientName, Encoding, TopicName
+from sern_core.vocabulary.types import ClientName, Encoding, ObjectKind, TopicName
 from sern_core.wire import framing
 from tests.fuzz.test_hostile_peer import Hostile
 from tests.world import World, spec
@@ -106,6 +107,48 @@ def test_what_is_no_change_is_refused_and_changes_nothing(change: dict[str, Any]
     assert {item.id for item in peer.hub.objects.select()} == {"robot/kept", "robot/later"}
     assert peer.hub.exchange.counts == {"taken": 2, "bad_object": 1}
     peer.hub.validate()
+
+
+def test_an_object_that_could_not_be_told_to_others_is_refused_and_harms_nobody() -> None:
+    """Its envelope is as long as one may be: with its owner's name, as others are told, it would be longer."""
+    world = World()
+    world.tell_objects()
+    site = world.client("site")
+    site.core.subscribe_objects([Selection()], now=site.now)
+    world.run(1.0)
+    peer = Owner(world, "mallory")
+    peer.now = world.now
+    fields = {f"k{number}": "v" * 460 for number in range(8)}
+    fields["k"] = "v" * (4096 - 40 - len("".join(fields)) - 8 * 464 - 64)
+    while (
+        framing.envelope_bytes({"op": "put", "id": "x", "kind": "node", "type": "a", "n": -1, "attr": fields})
+        < framing.MAX_ENVELOPE_BYTES
+    ):
+        fields["k"] += "v"
+    peer.put("x", attr=fields)
+    peer.put("y")
+    world.run(2.0)
+    assert [refused for refused, _text in world.relay.refusals] == ["too_large"]
+    assert set(site.core.mirror.objects) == {"y"} and not site.downs
+    world.relay.hub.validate()
+
+
+def test_what_fits_into_no_message_is_left_out_for_the_one_object() -> None:
+    world = World()
+    world.tell_objects()
+    site = world.client("site")
+    site.core.subscribe_objects([Selection()], now=site.now)
+    world.run(1.0)
+    objects = world.relay.hub.objects
+    for name, size in (("wide", 4000), ("fine", 10)):
+        objects.put(
+            name, owner=ClientName("relay"), kind=ObjectKind.TRANSFORM, type_name="t" * 200,
+            attributes={"a": "v" * size}, wall_ns=0, now=world.relay.now,
+        )  # fmt: skip
+    world.run(2.0)
+    assert set(site.core.mirror.objects) == {"fine"} and not site.downs
+    assert world.relay.hub.exchange.feeds[ClientName("site")].untold >= 1
+    world.check_faults()
 
 
 def test_a_subscription_that_is_none_ends_the_session_or_is_denied() -> None:
