@@ -230,7 +230,7 @@ class Demo:
                 for name in (RELAY, SITE, ROBOT):
                     command = self.options.relay_command if name == RELAY else self.options.client_command
                     daemons[name] = await children.start(name, [*command, "--config", str(files[name])])
-                    ready = partial(_ready, session, web[name])
+                    ready = partial(is_ready, session, web[name])
                     await children.until(ready, START_S, f"{name} is not ready ({where})", every_s=0.05)
                 arriving = partial(_arriving, session, web[SITE])
                 problem = f"none of the robot's messages arrived ({where})"
@@ -239,9 +239,9 @@ class Demo:
                 behaviour = Behaviour()
 
                 async def sample(t_s: float, statistics: Mapping[str, Any]) -> Sample:
-                    topics = [await _get(session, f"{web[name]}/api/topics") or {} for name in (ROBOT, SITE)]
-                    links = await _get(session, f"{web[ROBOT]}/api/link") or []
-                    mmcf = await _get(session, f"{web[ROBOT]}/api/mmcf") or {}
+                    topics = [await get_json(session, f"{web[name]}/api/topics") or {} for name in (ROBOT, SITE)]
+                    links = await get_json(session, f"{web[ROBOT]}/api/link") or []
+                    mmcf = await get_json(session, f"{web[ROBOT]}/api/mmcf") or {}
                     adapting = next(iter(mmcf.get("links", ())), None)
                     behaviour.looks.append(Look.of(t_s, next(iter(links), None), adapting))
                     return _with_links(_sample(t_s, statistics, topics), links)
@@ -250,7 +250,7 @@ class Demo:
                 run.behaviour = behaviour
                 # Upstream first: what the robot still has goes to the relay, and from there to the site.
                 await children.end(daemons[ROBOT])
-                await _drained(children, partial(_get, session, f"{web[RELAY]}/api/link"))
+                await _drained(children, partial(get_json, session, f"{web[RELAY]}/api/link"))
                 await children.end(daemons[SITE])
                 await children.end(daemons[RELAY])
             finally:
@@ -342,7 +342,7 @@ async def _probed(robot: Child, site: Child) -> bool:
 # What the daemons say over HTTP ---------------------------------------------------------------------------------------
 
 
-async def _get(session: aiohttp.ClientSession, url: str) -> Any:
+async def get_json(session: aiohttp.ClientSession, url: str) -> Any:
     """The JSON there, or None while the daemon does not answer (it may be busy, or not there yet)."""
     try:
         async with session.get(url) as response:
@@ -351,7 +351,7 @@ async def _get(session: aiohttp.ClientSession, url: str) -> Any:
         return None
 
 
-async def _ready(session: aiohttp.ClientSession, url: str) -> bool:
+async def is_ready(session: aiohttp.ClientSession, url: str) -> bool:
     try:
         async with session.get(f"{url}/readyz") as response:
             return response.status == 200
@@ -360,7 +360,7 @@ async def _ready(session: aiohttp.ClientSession, url: str) -> bool:
 
 
 async def _arriving(session: aiohttp.ClientSession, url: str) -> bool:
-    topics = await _get(session, f"{url}/api/topics") or {}
+    topics = await get_json(session, f"{url}/api/topics") or {}
     return any(counters.get("delivered") for name, counters in topics.items() if name != COMMAND_TOPIC)
 
 
@@ -410,9 +410,10 @@ def _with_links(sample: Sample, links: Sequence[Mapping[str, Any]]) -> Sample:
 
 
 @contextmanager
-def _working_directory(options: Options) -> Iterator[Path]:
-    if options.keep:
-        path = options.out / f"run-{datetime.now().strftime('%Y%m%d-%H%M%S')}"
+def working_directory(out: Path, name: str, *, keep: bool) -> Iterator[Path]:
+    """A new folder for a run: in `out` where it is kept, else one that is gone afterwards."""
+    if keep:
+        path = out / f"{name}-{datetime.now().strftime('%Y%m%d-%H%M%S')}"
         path.mkdir(parents=True)
         yield path
         return
@@ -420,14 +421,19 @@ def _working_directory(options: Options) -> Iterator[Path]:
         yield path
 
 
-async def run(options: Options, console: Console) -> int:
-    """Run the demo, print the summary, write the report; the exit status. Ctrl-C is asyncio.CancelledError."""
+def cancelled_by_signals() -> None:
+    """Have Ctrl-C, SIGTERM and SIGHUP cancel the task that runs now."""
     task = asyncio.current_task()
     assert task is not None
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         loop.add_signal_handler(number, task.cancel)
-    with _working_directory(options) as directory:
+
+
+async def run(options: Options, console: Console) -> int:
+    """Run the demo, print the summary, write the report; the exit status. Ctrl-C is asyncio.CancelledError."""
+    cancelled_by_signals()
+    with working_directory(options.out, "run", keep=options.keep) as directory:
         report = await Demo(options, directory, console).run()
         console.print()
         demo_report.print_summary(report, console)

@@ -9,12 +9,8 @@ the twin is judged, and written with plots of error and bound over time.
 
 import asyncio
 import shlex
-import signal
 import sys
-import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,21 +25,28 @@ from sern_runtime.profiles import load_profile
 from sern_sim.profiles import LinkProfile
 from sern_sim.robot import Pose2
 from sern_tools import demo_twin_report as reporting
+from sern_tools.demo import (
+    EXIT_BROKEN,
+    EXIT_ERROR,
+    EXIT_INTERRUPTED,
+    EXIT_OK,
+    START_S,
+    cancelled_by_signals,
+    get_json,
+    is_ready,
+    working_directory,
+)
 from sern_tools.demo_link import LinkProcess
 from sern_tools.demo_scenario import FAR_HOST, HOST
 from sern_tools.demo_twin_report import Sample, TwinReport, judged
 from sern_tools.harness.files import Content, client_content, relay_content, write
-from sern_tools.harness.processes import Children, program, swept
+from sern_tools.harness.processes import Children, program
 from sern_tools.keygen import make_keys
 from sern_tools.ports import free_ports
 from sern_tools.shaping import RateSchedule
 
 RELAY, ROBOT, TWIN = "relay", "robot", "twin"
-EXIT_BROKEN: Final = 1
-EXIT_ERROR: Final = 2
-EXIT_INTERRUPTED: Final = 130
 PROFILE: Final = "demo-twin"
-START_S: Final = 120.0
 SETTLES_S: Final = 3.0
 """After the first pose, before the script begins: the twin learns how late the robot is."""
 LOOK_S: Final = 0.1
@@ -115,7 +118,7 @@ class Look:
     async def take(self, origin_s: float) -> Sample | None:
         """None: one of them did not answer, or the robot was not heard yet."""
         before_s = time.monotonic()
-        truth, twins = await asyncio.gather(*(_get(self._session, url) for url in self._urls))
+        truth, twins = await asyncio.gather(*(get_json(self._session, url) for url in self._urls))
         at_s = (before_s + time.monotonic()) / 2 - origin_s
         twin = (twins or {}).get(ROBOT)
         if truth is None or twin is None or twin["pose"] is None:
@@ -141,14 +144,6 @@ def _at(truth: Any, place: str, now_s: float) -> tuple[float, float, float]:
     return moved.x_m, moved.y_m, moved.yaw_rad
 
 
-async def _get(session: aiohttp.ClientSession, url: str) -> Any:
-    try:
-        async with session.get(url) as response:
-            return await response.json() if response.status == 200 else None
-    except (aiohttp.ClientError, TimeoutError, ValueError):
-        return None
-
-
 async def measure(options: Options, directory: Path, console: Console) -> list[Sample]:
     """Run it, and what was seen. SernError: something could not run."""
     relay_port, *ports = free_ports(4)
@@ -171,7 +166,7 @@ async def measure(options: Options, directory: Path, console: Console) -> list[S
         try:
             for name in (RELAY, TWIN, ROBOT):
                 await children.start(name, [*commands[name], "--config", str(files[name])])
-                ready = partial(_answers, session, f"http://{HOST}:{web[name]}/readyz")
+                ready = partial(is_ready, session, f"http://{HOST}:{web[name]}")
                 await children.until(ready, START_S, f"{name} is not ready ({where})", every_s=0.05)
             look = Look(session, web)
 
@@ -184,14 +179,6 @@ async def measure(options: Options, directory: Path, console: Console) -> list[S
             return await _watch(options, link, children, look, console)
         finally:
             link.close()
-
-
-async def _answers(session: aiohttp.ClientSession, url: str) -> bool:
-    try:
-        async with session.get(url) as response:
-            return response.status == 200
-    except (aiohttp.ClientError, TimeoutError):
-        return False
 
 
 async def _watch(options: Options, link: LinkProcess, children: Children, look: Look, console: Console) -> list[Sample]:
@@ -215,28 +202,13 @@ async def _watch(options: Options, link: LinkProcess, children: Children, look: 
     return samples
 
 
-@contextmanager
-def _working_directory(options: Options) -> Iterator[Path]:
-    if options.keep:
-        path = options.out / f"twin-{time.strftime('%Y%m%d-%H%M%S')}"
-        path.mkdir(parents=True)
-        yield path
-        return
-    with swept(Path(tempfile.mkdtemp(prefix="sern-demo-twin-"))) as path:
-        yield path
-
-
 async def run(options: Options, console: Console) -> TwinReport:
     """Ctrl-C is asyncio.CancelledError."""
-    task = asyncio.current_task()
-    assert task is not None
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        loop.add_signal_handler(number, task.cancel)
+    cancelled_by_signals()
     console.print(f"{options.profile.description}; {options.duration_s:g} s", highlight=False)
     if options.view_port is not None:
         console.print(f"watch it: http://{HOST}:{options.view_port}", highlight=False)
-    with _working_directory(options) as directory:
+    with working_directory(options.out, "twin", keep=options.keep) as directory:
         samples = await measure(options, directory, console)
         if options.keep:
             console.print(f"kept {directory}", highlight=False, soft_wrap=True)
@@ -278,7 +250,7 @@ def demo_twin(
         reporting.show(report, console)
         for path in reporting.write(report, out):
             console.print(f"wrote {path}", highlight=False, soft_wrap=True)
-        code = 0 if report.ok else EXIT_BROKEN
+        code = EXIT_OK if report.ok else EXIT_BROKEN
     except (SernError, OSError) as error:
         Console(stderr=True).print(f"sern demo-twin: {error}", highlight=False, markup=False, soft_wrap=True)
         code = EXIT_ERROR

@@ -6,8 +6,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from sern_client.endpoints.twin.bodies import ODOMETRY
-from sern_core.vocabulary.errors import BodyError, ConfigError
+from sern_client.endpoints.twin.bodies import ODOMETRY, read_message, stamp_of
+from sern_core.vocabulary.errors import BodyError
 from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 from sern_twin.world.grid import Floats, Grid
@@ -49,17 +49,17 @@ def read_scan(body: bytes, encoding: Encoding) -> Scan:
     """A sensor_msgs/LaserScan. BodyError: it is none, or too large."""
     if len(body) > MOST_SCAN_BYTES:
         raise BodyError(f"a scan of {len(body)} bytes: {MOST_SCAN_BYTES} at most")
-    message = _read(body, SCAN, encoding)
+    message = read_message(body, SCAN, encoding)
     ranges = np.asarray(message.ranges, np.float64)
     angles = message.angle_min + message.angle_increment * np.arange(len(ranges))
     if not 0 <= message.range_min < message.range_max < math.inf:
         raise BodyError(f"a scan of ranges from {message.range_min} to {message.range_max} m")
-    return Scan(_stamp_ns(message.header.stamp), angles, ranges, message.range_min, message.range_max)
+    return Scan(stamp_of(message.header.stamp), angles, ranges, message.range_min, message.range_max)
 
 
 def read_marker(body: bytes, encoding: Encoding) -> Marker:
     """A visualization_msgs/Marker that is a cube, sphere or cylinder. BodyError: it is none."""
-    message = _read(body, MARKER, encoding)
+    message = read_message(body, MARKER, encoding)
     if message.action == _DELETE_ALL:
         return Marker(None, message.header.frame_id, None)
     key = (str(message.ns), int(message.id))
@@ -125,14 +125,3 @@ class Writer:
     def _header(self, stamp_ns: int) -> Any:
         self._seq = (self._seq + 1) & 0xFFFFFFFF
         return ros_types.header(stamp_ns, self._grid.frame_id, self._encoding, self._seq)
-
-
-def _read(body: bytes, type_name: str, encoding: Encoding) -> Any:
-    try:
-        return ros_types.deserialise(body, type_name, encoding)
-    except ConfigError as error:
-        raise BodyError(str(error)) from error
-
-
-def _stamp_ns(stamp: Any) -> int:
-    return int(stamp.sec) * 10**9 + int(stamp.nanosec)

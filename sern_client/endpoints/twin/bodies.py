@@ -46,14 +46,14 @@ class Planned(NamedTuple):
 
 def read_pose(body: bytes, encoding: Encoding) -> Pose:
     """A nav_msgs/Odometry. BodyError: it is none."""
-    message = _read(body, ODOMETRY, encoding)
+    message = read_message(body, ODOMETRY, encoding)
     pose, twist = message.pose.pose, message.twist.twist
     motion = Motion(
         pose.position.x, pose.position.y, _yaw_rad(pose.orientation),
         Twist(twist.linear.x, twist.linear.y, twist.angular.z),
     )  # fmt: skip
     return Pose(
-        _stamp_ns(message.header.stamp), message.header.frame_id, message.child_frame_id, motion, pose.position.z
+        stamp_of(message.header.stamp), message.header.frame_id, message.child_frame_id, motion, pose.position.z
     )
 
 
@@ -63,32 +63,34 @@ def read_plan(body: bytes, type_name: str, encoding: Encoding, *, taken_ns: int)
     if len(body) > MOST_PLAN_BYTES:
         raise BodyError(f"a plan of {len(body)} bytes: {MOST_PLAN_BYTES} at most, so publish fewer of its poses")
     if plain_type(type_name) == plain_type(TRAJECTORY):
-        return _read_trajectory(_read(body, TRAJECTORY, encoding), taken_ns)
-    message = _read(body, PATH, encoding)
+        return _read_trajectory(read_message(body, TRAJECTORY, encoding), taken_ns)
+    message = read_message(body, PATH, encoding)
     places = tuple((each.pose.position.x, each.pose.position.y) for each in message.poses)
-    times_ns = tuple(_stamp_ns(each.header.stamp) for each in message.poses)
+    times_ns = tuple(stamp_of(each.header.stamp) for each in message.poses)
     timed = len(times_ns) > 1 and times_ns[0] > 0 and all(a < b for a, b in pairwise(times_ns))
     return Planned(message.header.frame_id, places, times_ns if timed else None)
 
 
 def _read_trajectory(message: Any, taken_ns: int) -> Planned:
     """The places of the first joint: that of the base in the world."""
-    begin_ns = _stamp_ns(message.header.stamp) or taken_ns
+    begin_ns = stamp_of(message.header.stamp) or taken_ns
     if not all(point.transforms for point in message.points):
         raise BodyError("a trajectory with a point that has no transform")
     places = [point.transforms[0].translation for point in message.points]
-    times_ns = tuple(begin_ns + _stamp_ns(point.time_from_start) for point in message.points)
+    times_ns = tuple(begin_ns + stamp_of(point.time_from_start) for point in message.points)
     return Planned(message.header.frame_id, tuple((place.x, place.y) for place in places), times_ns)
 
 
-def _read(body: bytes, type_name: str, encoding: Encoding) -> Any:
+def read_message(body: bytes, type_name: str, encoding: Encoding) -> Any:
+    """A body as a message. BodyError: it is none of that type."""
     try:
         return ros_types.deserialise(body, type_name, encoding)
     except ConfigError as error:
         raise BodyError(str(error)) from error
 
 
-def _stamp_ns(stamp: Any) -> int:
+def stamp_of(stamp: Any) -> int:
+    """A ROS time in nanoseconds."""
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
