@@ -50,7 +50,7 @@ class Seen(NamedTuple):
 
 
 def files(directory: Path, address: str, *, planned: bool) -> tuple[Path, Path]:
-    """Of the robot and of the twin. `planned`: the twin has the robot's plan."""
+    """The files of robot and twin. `planned`: the twin has the robot's plan."""
     robot = {
         "kind": "synthetic",
         "role": "robot",

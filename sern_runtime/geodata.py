@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from sern_twin.world.terrain import ElevationRaster
 
 MOST_FILE_BYTES: Final = 64_000_000
-"""Of GeoJSON and of an extract: a site is a few streets, and both become many times as large in memory."""
+"""GeoJSON and extracts are no larger: a site is a few streets, and both become many times as large in memory."""
 MOST_FEATURES: Final = 200_000
 MARGIN_PIXELS: Final = 2
 """Around a grid, for what lies between the middles of pixels."""

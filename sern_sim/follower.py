@@ -31,7 +31,7 @@ class FollowerOptions:
 
 
 ON_HILLS: Final = FollowerOptions(along_per_s=2.5, across_per_m2=8.0)
-"""Of a base that slides down slopes while it turns."""
+"""The gains for a base that slides down slopes while it turns."""
 
 
 class Follower:

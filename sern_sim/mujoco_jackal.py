@@ -56,7 +56,7 @@ _MOST_PIXELS: Final = 4096  # of rays a picture; a larger one repeats them
 _WHEELS: Final = ("fl", "fr", "rl", "rr")
 _CONTACT, _MESH, _BLOCKS, _ROBOT = range(4)  # groups of geoms; rays look at the middle two
 KV: Final = 30.0
-"""Of a wheel's motor, N·m for each rad/s that it is off: stiff, so that it stands on a slope."""
+"""The gain of a wheel's motor, N·m for each rad/s that it is off: stiff, so that it stands on a slope."""
 _BASE_Z_M: Final = 0.13
 _XML: Final = """
 <mujoco model="jackal">

@@ -120,7 +120,7 @@ class Terrain:
         return tuple(blocks)
 
     def height_m(self, x_m: float, y_m: float) -> float:
-        """Of the ground at a place, bilinear; outside, that of the edge."""
+        """The ground's height at a place, bilinear; outside, that of the edge."""
         last = len(self.heights_m) - 1
         column = min(max((x_m + self.half_size_m) / (2 * self.half_size_m), 0.0), 1.0) * last
         row = min(max((y_m + self.half_size_m) / (2 * self.half_size_m), 0.0), 1.0) * last

@@ -259,7 +259,7 @@ class SyntheticEndpoint:
 
     @property
     def json_routes(self) -> Mapping[str, Callable[[], object]]:
-        """Of a robot, where it truly is, where it thinks it is, and when (`now_s`, seconds of this machine's clock)."""
+        """The place where a robot truly is, where it thinks it is, and when (`now_s`, this machine's clock)."""
         robot = self._robot
         if robot is None:
             return {}

@@ -19,7 +19,7 @@ GRID: Final = "nav_msgs/msg/OccupancyGrid"
 UPDATE: Final = "map_msgs/msg/OccupancyGridUpdate"
 MOST_SCAN_BYTES: Final = 512 * 1024
 CORNERS: Final = 16
-"""Of a cylinder's outline."""
+"""A cylinder's outline has so many."""
 _CUBE, _SPHERE, _CYLINDER = 1, 2, 3
 _ADD, _DELETE, _DELETE_ALL = 0, 2, 3
 __all__ = ["GRID", "MARKER", "ODOMETRY", "SCAN", "UPDATE", "Marker", "Scan", "Writer", "read_marker", "read_scan"]

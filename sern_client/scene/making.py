@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from sern_twin.world.primitives import Primitive
 
 GROUND_CELLS: Final = 200
-"""Of the ground along a side, as it is shown: 80,000 triangles at the most."""
+"""The ground is shown with so many cells along a side: 80,000 triangles at the most."""
 
 _log = logging.getLogger(__name__)
 

@@ -41,7 +41,7 @@ PERIOD_S: Final = 0.1
 WHOLE_S: Final = 5.0
 """How often the whole map is published at most: to who comes late, the last one is latched."""
 MOST_UPDATES: Final = 64
-"""Of more blocks that change at once the whole map is published."""
+"""Where more blocks change at once, the whole map is published."""
 OFFSETS_S: Final = 1.0
 OFFSET_RADIUS_M: Final = 0.5
 """How far from where it was added an obstacle is looked for in what is seen."""

@@ -9,7 +9,7 @@ from math import inf
 from typing import Final
 
 SHARE: Final = 0.15
-"""Of what is sent: copies that are less make no queue."""
+"""Copies that are less than this share of what is sent make no queue."""
 GAIN: Final = 0.02
 """The share is over about the last fifty datagrams."""
 FIRST_REST_S: Final = 5.0

@@ -25,7 +25,7 @@ BLOCK_CELLS: Final = range(4, 65)
 MOST_M: Final = 1e7
 MOST_NAME: Final = 256
 NOWHERE: Final = -1
-"""In place of the row, column or number of what is not on the grid."""
+"""The row, column or number of what is not on the grid."""
 _ID_BYTES: Final = 8
 
 

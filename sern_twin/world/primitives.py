@@ -22,7 +22,7 @@ from sern_twin.world.terrain import Terrain
 Geometry = Any
 """A shapely geometry: the library has no types."""
 MOST_POINTS: Final = 100_000
-"""Of one feature."""
+"""One feature has no more of them."""
 LEAST_M2: Final = 1e-4
 FAR_M: Final = 100_000.0
 """The tangent plane is none so far from its point."""

@@ -43,7 +43,7 @@ class Outcome(Enum):
     OLD = "old"
     """This version of the block is known, or a newer one: nothing was done."""
     OWN = "own"
-    """Of this scene's writer, and newer than what it published: it was another process before. It says its own anew."""
+    """It is this scene's writer's, from another process before, and newer: the scene says its own anew."""
     LEAP = "leap"
     """Its version is too far above all others."""
     TOO_MANY_WRITERS = "too_many_writers"
@@ -90,7 +90,7 @@ class Scene:
 
     @property
     def version(self) -> int:
-        """Of what was published last, or heard: to ask `changed` with later."""
+        """The version of what was published last, or heard: to ask `changed` with later."""
         return self._version
 
     @property

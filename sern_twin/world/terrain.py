@@ -17,7 +17,7 @@ Fill = Literal["nearest", "none"]
 MOST_PIXELS: Final = 4_000_000
 LOWEST_M: Final = -12_000.0
 HIGHEST_M: Final = 9_000.0
-"""Of the Earth's surface. What lies beyond is no height but a raster's word for none, such as -32768."""
+"""The Earth's surface lies within. What lies beyond is a raster's word for no height, such as -32768."""
 _FIT_PIXELS: Final = 10_000
 _STEPS: Final = 5
 """To the pixel of a place. A map projection is so nearly straight that each step is a thousand times nearer."""

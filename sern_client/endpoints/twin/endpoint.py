@@ -53,7 +53,7 @@ TYPES: Final = {
     "unity": bodies.POSE,
 }
 LEVELS: Final = ("ok", "warn", "error", "stale")
-"""Of diagnostic_msgs/DiagnosticStatus, in words."""
+"""The levels of diagnostic_msgs/DiagnosticStatus, in words."""
 SLOW: Final = frozenset({"path", "status"})
 
 

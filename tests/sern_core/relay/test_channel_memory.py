@@ -21,7 +21,7 @@ LARGE_BLOCK_BYTES: Final = 200_000
 
 @pytest.mark.parametrize("reliable", [False, True])
 def test_a_channel_on_which_nothing_was_sent_is_small(reliable: bool) -> None:
-    """Of two measurements the lesser: a smaller table of the process may grow in one, not in both."""
+    """The lesser of two measurements counts: a smaller table of the process may grow in one, not in both."""
     assert min(channel_bytes(reliable=reliable) for _ in range(2)) <= MAX_CHANNEL_BYTES
 
 

@@ -21,7 +21,7 @@ BOX_M = (3.0, 1.0, 0.5)
 
 
 def ranges_m(x_m: float, y_m: float, yaw_rad: float, noise: Random) -> list[float]:
-    """Of a scanner in a square room with a box in it."""
+    """The ranges of a scanner in a square room with a box in it."""
     found = []
     for angle in (ANGLES_RAD + yaw_rad).tolist():
         along = math.cos(angle), math.sin(angle)

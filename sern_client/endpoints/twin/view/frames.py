@@ -23,7 +23,7 @@ _SNAPSHOT_BYTES: Final = 256
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Of a base in the robot's frame: east, north, height, and its heading from east to north."""
+    """The place of a base in the robot's frame: east, north, height, and its heading from east to north."""
 
     x_m: float
     y_m: float

@@ -153,7 +153,7 @@ def _coloured(text: str, colour: Colour) -> str:
 
 
 def _share_nothing(verbose: bool = True) -> None:
-    """In place of viser's tunnel to the open Internet, for which any browser that is connected can ask."""
+    """Refuse viser's tunnel to the open Internet, for which any browser that is connected can ask."""
     del verbose
 
 

@@ -25,7 +25,7 @@ BLOCKS_S: Final = 1.0
 AGES_S: Final = 10.0
 """The same while it does not, and only gets older."""
 SHARE: Final = 0.25
-"""Of the time, at most, goes into snapshots and into drawing: of hundreds of robots there are fewer pictures."""
+"""Snapshots and drawing take this share of the time at most: of hundreds of robots there are fewer pictures."""
 PAUSE_S: Final = 1.0
 """After a failure."""
 
