@@ -168,8 +168,9 @@ class ObjectFeed:
             return
         text = self._text_of(item)
         put = put_of(item, text, upto=upto)
+        texts = hash((put[:6], tuple(put.attributes.items())))
         try:
-            whole = encode(put)
+            body = encode(set_of(put) if known_version and known_texts == texts else put)
         except UsageError:
             self.untold += 1  # of this object alone: the others go on
             return
@@ -177,9 +178,8 @@ class ObjectFeed:
         if text and named not in self._texts:
             self._texts.add(named)
             self._say(encode(Define(named, text)), now)
-        texts = hash((put[:6], tuple(put.attributes.items())))
         self._told[object_id] = item.version, texts
-        self._say(encode(set_of(put)) if known_version and known_texts == texts else whole, now)
+        self._say(body, now)
         self._open = bool(self._pending)
 
     def _say(self, body: bytes, now: float) -> None:

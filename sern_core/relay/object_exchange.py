@@ -192,7 +192,7 @@ class ObjectExchange:
         if about is not None and about[2] is not None:
             raise RefusedError("not_owner", f"{client} may not put {change.object_id[:80]}: it stands for a topic")
         try:
-            encode(change._replace(owner=client, upto=2**62))  # as it is told to others
+            encode(change._replace(owner=client, value=b"", upto=2**62))  # as it is told to others
         except UsageError as error:
             raise RefusedError("too_large", f"{client} may not put {change.object_id[:80]}: {error}") from error
         self._registry.put(
