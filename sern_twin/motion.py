@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from typing import Final
 
 TAU: Final = 2 * math.pi
+MOST_M: Final = 1e7
+"""No place of a site is further from its origin: a quarter of the way round the Earth."""
 _STRAIGHT_RAD: Final = 1e-6
 """Below this turn the series is exact in a float."""
 

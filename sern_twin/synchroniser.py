@@ -18,7 +18,7 @@ from typing import Final
 from sern_core.vocabulary.errors import UsageError
 from sern_twin.bound import GapReport, Mismatch, reachable_bound_m
 from sern_twin.correction import CorrectionOptions, Offset, Outage
-from sern_twin.motion import TAU, Motion
+from sern_twin.motion import MOST_M, TAU, Motion
 from sern_twin.predictors import MOST_STEPS, SOON_S, Limited, Predictor
 
 HISTORY_S: Final = 2.0
@@ -26,8 +26,6 @@ TRIAL_S: Final = 0.5
 """How far ahead each prediction is tried while the robot is heard, to learn how wrong it gets."""
 TOO_MUCH: Final = 1.5
 """Times its limit: what is measured is noisy. More is a fault, and would lead the twin away at that speed."""
-MOST_M: Final = 1e7
-"""No place of a site is further from its origin: a quarter of the way round the Earth."""
 MOST_S: Final = 1e10
 """Nothing that is told now is of 300 years ago."""
 

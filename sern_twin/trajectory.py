@@ -4,7 +4,6 @@ trajectory_msgs)."""
 import math
 from bisect import bisect_right
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import Final, NamedTuple
 
 from sern_core.vocabulary.errors import BodyError
@@ -12,10 +11,6 @@ from sern_twin.motion import TAU, Motion, Twist
 
 MOST_POINTS: Final = 100_000
 """More are of no plan: a robot that sends them would fill the twin's memory."""
-PART_M: Final = 0.25
-"""How far apart the points of a path without times are at the most."""
-MOST_PARTS: Final = 5_000
-"""Of a path of more than 1.25 km they are longer: it is cut anew every few seconds, and all twins wait for that."""
 _SAME_M: Final = 1e-3
 
 
@@ -101,55 +96,6 @@ class Trajectory:
         start = min(number, len(self._x_m) - 2)
         x_m, y_m = self._x_m[start + 1] - self._x_m[start], self._y_m[start + 1] - self._y_m[start]
         return (x_m, y_m) if math.hypot(x_m, y_m) >= _SAME_M else (0.0, 0.0)
-
-
-def paced(way: Sequence[tuple[float, float]], start: Motion, start_s: float, speed_mps: float) -> Trajectory:
-    """A path without times, as a robot drives it that is at `start` and goes on at this speed: from the place of the
-    path that is nearest to it, to the end. BodyError as above, and for a speed that is not above 0 or a path whose end
-    is where the robot is."""
-    if not (math.isfinite(speed_mps) and speed_mps > 0):
-        raise BodyError(f"a path cannot be driven at {speed_mps} m/s")
-    if len(way) < 2 or not all(math.isfinite(value) for point in way for value in point):
-        raise BodyError(f"a path of {len(way)} points, all finite: it takes two")
-    _, part, foot = min(
-        (
-            (math.dist(at, (start.x_m, start.y_m)), number, at)
-            for number in range(len(way) - 1)
-            for at in (_foot(way[number], way[number + 1], start),)
-        ),
-    )
-    # Curves through points that are far apart would cut corners.
-    part_m = max(PART_M, sum(math.dist(a, b) for a, b in pairwise(way)) / MOST_PARTS)
-    points = [Waypoint(start_s, *foot)]
-    time_s, last = start_s, foot
-    for point in way[part + 1 :]:
-        length_m = math.dist(last, point)
-        if length_m < _SAME_M:
-            continue
-        parts = max(1, math.ceil(length_m / part_m))
-        for number in range(1, parts + 1):
-            share = number / parts
-            points.append(
-                Waypoint(
-                    time_s + share * length_m / speed_mps,
-                    last[0] + share * (point[0] - last[0]),
-                    last[1] + share * (point[1] - last[1]),
-                )
-            )
-        time_s += length_m / speed_mps
-        last = point
-    return Trajectory(points)
-
-
-def _foot(begin: tuple[float, float], end: tuple[float, float], motion: Motion) -> tuple[float, float]:
-    """The place between the two that is nearest."""
-    x_m, y_m = end[0] - begin[0], end[1] - begin[1]
-    squared = x_m**2 + y_m**2
-    if squared == 0:
-        return begin
-    share = ((motion.x_m - begin[0]) * x_m + (motion.y_m - begin[1]) * y_m) / squared
-    share = min(max(share, 0.0), 1.0)
-    return begin[0] + share * x_m, begin[1] + share * y_m
 
 
 def _slopes(times_s: Sequence[float], values: Sequence[float], still: set[int]) -> list[float]:

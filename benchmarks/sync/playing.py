@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 from benchmarks.sync.recording import Heard, Recording
-from sern_core.vocabulary.errors import BodyError
 from sern_sim.robot import STEP_S
 from sern_twin.following import Following
 from sern_twin.motion import STILL, Motion
@@ -20,7 +19,8 @@ from sern_twin.predictors import (
 )
 from sern_twin.slip import Slip
 from sern_twin.synchroniser import Gap, Synchroniser, SynchroniserOptions, Twin
-from sern_twin.trajectory import paced
+from sern_twin.way import PathTracking
+from sern_twin.way import Way as Path
 
 LEARNS_S: Final = 2.0
 """How often what was learned goes into the predictor."""
@@ -52,10 +52,8 @@ def ways(recording: Recording) -> dict[str, Way]:
     slip = Slip()
     last: list[Heard] = []
     step_s = (recording.way.end_s - recording.way.start_s) / 200
-    path = [
-        (point.x_m, point.y_m)
-        for point in (recording.way.at(recording.way.start_s + number * step_s) for number in range(200))
-    ]
+    points = [recording.way.at(recording.way.start_s + number * step_s) for number in range(201)]
+    path = Path([(point.x_m, point.y_m) for point in points])
 
     def learn(heard: Heard) -> None:
         if last:
@@ -69,13 +67,9 @@ def ways(recording: Recording) -> dict[str, Way]:
         del last[:-50]
 
     def along() -> Predictor:
-        if len(last) < 2:
-            return ConstantTwist()
-        speed_mps = sum(heard.found.speed_mps for heard in last) / len(last)
-        try:
-            return PlanTracking(paced(path, last[-1].found, last[-1].stamp_s, speed_mps))
-        except BodyError:
-            return ConstantTwist()
+        if not last or not path.followed_by(last[-1].found):
+            return ConstantAcceleration()
+        return PathTracking(path, sum(heard.found.speed_mps for heard in last) / len(last))
 
     def told() -> Predictor:
         return LastCommand(Command(last[-1].stamp_s, last[-1].told), slip) if last else ConstantTwist()

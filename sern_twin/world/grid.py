@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sern_core.vocabulary.errors import UsageError
 from sern_twin.geodesy import TangentPlane
+from sern_twin.motion import MOST_M
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -22,7 +23,6 @@ MOST_SIDE: Final = 65_535
 MOST_BLOCKS: Final = 65_536
 BLOCK_CELLS: Final = range(4, 65)
 """Cells along the side of a block. The patch of the largest block has 4 kB at the most."""
-MOST_M: Final = 1e7
 MOST_NAME: Final = 256
 NOWHERE: Final = -1
 """The row, column or number of what is not on the grid."""

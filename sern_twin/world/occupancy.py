@@ -9,12 +9,13 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sern_core.vocabulary.errors import UsageError
+from sern_twin.motion import MOST_M
 from sern_twin.world.grid import NOWHERE, Floats, Grid
 from sern_twin.world.patches import OCCUPIED, Cells
 from sern_twin.world.rays import crossed
@@ -22,7 +23,6 @@ from sern_twin.world.rays import crossed
 Pose = tuple[float, float, float]
 """East, north [m] and yaw [rad] of the scanner in the grid's frame."""
 MOST_BEAMS: Final = 100_000
-MOST_M: Final = 1e7
 MOST_RANGE_M: Final = 1e5
 MOST_RAD: Final = 1e6
 UNSURE_CELLS: Final = 1.5
@@ -48,6 +48,18 @@ class Ignored(Enum):
     """A point that is higher than the robot."""
     OUTSIDE = "outside"
     """A point that is not on the grid."""
+
+
+class Sight(NamedTuple):
+    """What one scan or cloud says: cells that it saw through, and cells that it saw something in, (rows, columns)."""
+
+    free: NDArray[np.bool_]
+    occupied: NDArray[np.bool_]
+
+    @property
+    def cells(self) -> int:
+        """How many were seen."""
+        return int(np.count_nonzero(self.free)) + int(np.count_nonzero(self.occupied))
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,11 +112,11 @@ class Occupancy:
 
     def fuse(
         self, pose: Pose, angles_rad: ArrayLike, ranges_m: ArrayLike, range_max_m: float, *, range_min_m: float = 0.0
-    ) -> int:
+    ) -> Sight:
         """Take a planar scan, (n,) angles from the scanner's own axis and ranges as in sensor_msgs/LaserScan.
 
         Infinite: nothing is there up to `range_max_m`. NaN, negative and what is out of range says nothing and is
-        counted. How many cells were seen. UsageError: shapes that differ, more than `MOST_BEAMS`, no range at all.
+        counted. What it says of which cells. UsageError: shapes that differ, more than `MOST_BEAMS`, no range at all.
         """
         angles, ranges = np.asarray(angles_rad, np.float64), np.asarray(ranges_m, np.float64)
         if angles.ndim != 1 or angles.shape != ranges.shape or len(angles) > MOST_BEAMS:
@@ -118,7 +130,7 @@ class Occupancy:
         x_m, y_m, yaw_rad = pose
         if not (abs(x_m) <= MOST_M and abs(y_m) <= MOST_M and abs(yaw_rad) <= MOST_RAD):
             self._ignored[Ignored.POSE] += len(ranges)
-            return 0
+            return Sight(np.zeros(self.grid.shape, np.bool_), np.zeros(self.grid.shape, np.bool_))
         used = self._usable(angles, ranges, range_min_m, range_max_m)
         angles, ranges = yaw_rad + angles[used], ranges[used]
         origin = np.array([x_m, y_m])
@@ -134,11 +146,11 @@ class Occupancy:
 
     def fuse_points(
         self, points_m: ArrayLike, *, ground_m: ArrayLike = 0.0, low_m: float = 0.1, high_m: float = 2.0
-    ) -> int:
+    ) -> Sight:
         """Take a cloud, (n, 3) or more in the grid's frame, over the ground [m] below each point, or below all.
 
         What stands `low_m` to `high_m` above the ground is in the way. A cell where there is only ground, within
-        `low_m` of it, is free. All else is counted. How many cells were seen. UsageError: another shape, no band.
+        `low_m` of it, is free. All else is counted. What it says of which cells. UsageError: another shape, no band.
         """
         points, ground = np.asarray(points_m, np.float64), np.asarray(ground_m, np.float64)
         if points.ndim != 2 or points.shape[1] < 3:
@@ -210,7 +222,7 @@ class Occupancy:
             left &= ~where
         return left
 
-    def _update(self, free: NDArray[np.bool_], occupied: NDArray[np.bool_]) -> int:
+    def _update(self, free: NDArray[np.bool_], occupied: NDArray[np.bool_]) -> Sight:
         """Say once of each cell that it is free or, which counts more, occupied."""
         free &= ~occupied
         options = self._options
@@ -219,7 +231,7 @@ class Occupancy:
         odds += np.where(occupied[seen], _log_odds(options.hit), _log_odds(options.miss)).astype(np.float32)
         self._odds[seen] = np.clip(odds, _log_odds(options.least), _log_odds(options.most))
         self._seen |= seen
-        return len(odds)
+        return Sight(free, occupied)
 
 
 def _log_odds(probability: float) -> np.float32:

@@ -28,6 +28,7 @@ FORMAT: Final = 1
 LAYERS: Final = ("base", "live", "twin_only")
 """By their numbers in a patch: what the map says, what robots see now, what is in the twin alone."""
 UNKNOWN: Final = -1
+FREE: Final = 0
 OCCUPIED: Final = 100
 MOST_VERSION: Final = 2**64 - 1
 MOST_WRITER_BYTES: Final = 64

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sern_core.vocabulary.errors import UsageError
-from sern_twin.world.grid import MOST_M, Floats, Grid, need_cells
+from sern_twin.motion import MOST_M
+from sern_twin.world.grid import Floats, Grid, need_cells
 from sern_twin.world.patches import (
     LAYERS,
     MOST_VERSION,

@@ -5,8 +5,8 @@ import math
 import pytest
 
 from sern_core.vocabulary.errors import BodyError
-from sern_twin.motion import STILL, Motion
-from sern_twin.trajectory import Trajectory, Waypoint, paced
+from sern_twin.motion import STILL
+from sern_twin.trajectory import Trajectory, Waypoint
 
 
 def circle(points: int, *, yaw: bool, radius_m: float = 2.0, duration_s: float = 10.0) -> Trajectory:
@@ -100,29 +100,3 @@ def test_two_waypoints_are_a_line() -> None:
 def test_what_is_no_trajectory(points: list[Waypoint], said: str) -> None:
     with pytest.raises(BodyError, match=said):
         Trajectory(points)
-
-
-def test_a_path_without_times_is_driven_from_where_the_robot_is() -> None:
-    corner = [(0.0, 0.0), (4.0, 0.0), (4.0, 3.0)]
-    driven = paced(corner, Motion(1.0, 0.2, 0.0), 10.0, 0.5)
-    assert (driven.start_s, driven.end_s) == pytest.approx((10.0, 10 + (3 + 3) / 0.5))
-    assert (driven.at(10.0).x_m, driven.at(10.0).y_m) == pytest.approx((1.0, 0.0)), "the nearest place of the path"
-    assert (driven.at(16.0).x_m, driven.at(16.0).y_m) == pytest.approx((4.0, 0.0))
-    assert (driven.at(30.0).x_m, driven.at(30.0).y_m) == pytest.approx((4.0, 3.0)), "it stands at the end"
-
-
-@pytest.mark.parametrize(
-    ("way", "speed_mps"),
-    [
-        ([(0.0, 0.0)], 1.0),
-        ([(0.0, 0.0), (0.0, 0.0)], 1.0),
-        ([(0.0, 0.0), (math.nan, 0.0)], 1.0),
-        ([(-2.0, 0.0), (-1.0, 0.0)], 1.0),
-        ([(0.0, 0.0), (1.0, 0.0)], 0.0),
-        ([(0.0, 0.0), (1.0, 0.0)], math.inf),
-    ],
-    ids=["one point", "one place", "not finite", "behind it", "no speed", "any speed"],
-)
-def test_a_path_that_cannot_be_driven(way: list[tuple[float, float]], speed_mps: float) -> None:
-    with pytest.raises(BodyError):
-        paced(way, Motion(0.0, 0.0, 0.0), 0.0, speed_mps)

@@ -15,11 +15,12 @@ from sern_client.endpoints.twin.bodies import Planned, Pose
 from sern_client.endpoints.twin.options import RobotOptions
 from sern_core.vocabulary.errors import BodyError
 from sern_twin.acceleration import Accelerations
-from sern_twin.following import Following
+from sern_twin.following import MOVES_MPS, Following
 from sern_twin.motion import Motion
 from sern_twin.predictors import ConstantAcceleration, PlanTracking, Predictor
 from sern_twin.synchroniser import TAKEN, Gap, Outcome, Synchroniser, SynchroniserOptions, Twin
-from sern_twin.trajectory import Trajectory, Waypoint, paced
+from sern_twin.trajectory import Trajectory, Waypoint
+from sern_twin.way import PathTracking, Way
 
 LEARNS_S: Final = 2.0
 """How often what was learned of a plan goes into the prediction."""
@@ -55,7 +56,8 @@ class RobotTwin:
             ),
         )
         self._following: Following | None = None
-        self._path: tuple[tuple[float, float], ...] = ()
+        self._way: Way | None = None
+        """A plan without times."""
         self._predictor: Predictor = ConstantAcceleration()
         self._learned_s = -math.inf
         self._followed = False
@@ -75,7 +77,7 @@ class RobotTwin:
         """What it goes on by while nothing is heard."""
         if not self._followed:
             return "acceleration"
-        return "path" if self._path else "trajectory"
+        return "trajectory" if self._way is None else "path"
 
     @property
     def last_heard(self) -> Motion | None:
@@ -127,7 +129,11 @@ class RobotTwin:
                 self.refused["short"] += 1
                 raise BodyError(f"it has {len(plan.places)} poses: a plan has two at least")
             if plan.times_ns is None:
-                self._path = plan.places
+                try:
+                    self._way = Way(plan.places)
+                except BodyError:
+                    self.refused["bad"] += 1
+                    raise
                 return
             base_s = now - age_s
             points = [
@@ -149,32 +155,28 @@ class RobotTwin:
             self._learn(now)
 
     def _drop_plan(self) -> None:
-        self._following, self._path = None, ()
+        self._following, self._way = None, None
 
     def _learn(self, now: float) -> None:
         """Take the best way to go on, from time to time, and at once when it is another."""
-        following = self._following
-        if self._path and self._heard:
-            if now - self._learned_s < LEARNS_S:
-                return
-            following = self._along()
-        follows = following is not None and (following.follows or bool(self._path))
+        follows = self._follows()
         if follows == self._followed and now - self._learned_s < LEARNS_S:
             return
         self._learned_s, self._followed = now, follows
-        if following is not None and follows:
-            self._predictor = PlanTracking(following.plan, delay_s=following.delay_s)
+        if follows and self._way is not None:
+            self._predictor = PathTracking(self._way, fmean(motion.speed_mps for _, motion in self._heard))
+        elif follows and self._following is not None:
+            self._predictor = PlanTracking(self._following.plan, delay_s=self._following.delay_s)
         else:
             self._predictor = ConstantAcceleration()
         self._synchroniser.predict_with(self._predictor, now=now)
 
-    def _along(self) -> Following | None:
-        """A path without times, at the speed that the robot has had."""
-        stamp_s, last = self._heard[-1]
-        try:
-            return Following(paced(self._path, last, stamp_s, fmean(motion.speed_mps for _, motion in self._heard)))
-        except BodyError:
-            return None  # it stands, or is at the end
+    def _follows(self) -> bool:
+        """Whether it does what its plan says."""
+        if self._way is None:
+            return self._following is not None and self._following.follows
+        last = self.last_heard
+        return last is not None and last.speed_mps >= MOVES_MPS and self._way.followed_by(last)
 
     def _report(self, gap: Gap) -> None:
         report = gap.report

@@ -66,12 +66,12 @@ def test_a_scan_frees_its_rays_and_fills_their_ends() -> None:
     world = Occupancy(GRID)
     for _ in range(15):
         seen = world.fuse((0.1, 0.1, math.pi / 2), [0.0, -math.pi / 2], [2.0, math.inf], 3.0)
-    assert seen == 7 + 1 + 12, "just before its end a ray says nothing"
+    assert seen.cells == 7 + 1 + 12, "just before its end a ray says nothing"
     classes = world.classes()
     assert classes[24, 20] == 100, "2 m to the north"
     assert (classes[16:23, 20] == 0).all() and classes[23, 20] == -1
     assert (classes[16, 20:33] == 0).all(), "nothing is there up to 3 m to the east"
-    assert np.count_nonzero(classes != -1) == seen
+    assert np.count_nonzero(classes != -1) == seen.cells
     cells = world.cells()
     assert (cells[24, 20], cells[20, 20], cells[0, 0]) == (97, 12, -1), "clamped"
     assert world.probabilities()[24, 20] == pytest.approx(0.97)
@@ -101,23 +101,23 @@ def test_readings_that_say_nothing_are_counted() -> None:
     world = Occupancy(GRID)
     angles = [0.0, 0.0, 0.0, 0.0, 0.0, math.nan, math.inf, 1e300]
     ranges = [math.nan, -1.0, -math.inf, 0.01, 3.1, 1.0, 1.0, 1.0]
-    assert world.fuse((0.0, 0.0, 0.0), angles, ranges, 3.0, range_min_m=0.05) == 0
+    assert world.fuse((0.0, 0.0, 0.0), angles, ranges, 3.0, range_min_m=0.05).cells == 0
     counted = {reason: count for reason, count in world.ignored.items() if count}
     assert counted == {
         Ignored.NAN: 1, Ignored.NEGATIVE: 2, Ignored.TOO_NEAR: 1, Ignored.TOO_FAR: 1, Ignored.ANGLE: 3,
     }  # fmt: skip
     for pose in ((math.nan, 0.0, 0.0), (0.0, math.inf, 0.0), (0.0, 0.0, math.nan), (1e300, 0.0, 0.0)):
-        assert world.fuse(pose, [0.0, 1.0], [1.0, 1.0], 3.0) == 0
+        assert world.fuse(pose, [0.0, 1.0], [1.0, 1.0], 3.0).cells == 0
     assert world.ignored[Ignored.POSE] == 8
     assert (world.cells() == -1).all()
-    assert world.fuse((0.0, 0.0, 0.0), [], [], 3.0) == 0
+    assert world.fuse((0.0, 0.0, 0.0), [], [], 3.0).cells == 0
 
 
 def test_a_scanner_outside_the_grid_sees_what_is_on_it() -> None:
     world = Occupancy(GRID)
-    assert world.fuse((-6.0, 0.1, 0.0), [0.0, math.pi], [3.0, 3.0], 10.0) == 8
+    assert world.fuse((-6.0, 0.1, 0.0), [0.0, math.pi], [3.0, 3.0], 10.0).cells == 8
     assert world.cells()[16, 8] == 70
-    assert world.fuse((-60.0, 0.1, 0.0), [0.0], [3.0], 10.0) == 0
+    assert world.fuse((-60.0, 0.1, 0.0), [0.0], [3.0], 10.0).cells == 0
 
 
 def test_a_scan_that_is_none_is_refused() -> None:
@@ -137,7 +137,7 @@ def test_a_cloud_fills_what_stands_on_the_ground() -> None:
         (2.1, 0.1, 13.0), (3.1, 0.1, 9.0), (90.0, 0.1, 10.5), (math.nan, 0.1, 10.5), (0.1, 0.1, math.inf),
     ]  # fmt: skip
     for _ in range(9):
-        assert world.fuse_points(points, ground_m=10.0) == 2
+        assert world.fuse_points(points, ground_m=10.0).cells == 2
     classes = world.classes()
     assert (classes[16, 20], classes[16, 24]) == (0, 100)
     assert np.count_nonzero(classes != -1) == 2
@@ -150,11 +150,11 @@ def test_a_cloud_fills_what_stands_on_the_ground() -> None:
 def test_the_ground_of_a_cloud_may_differ_and_be_unknown() -> None:
     world = Occupancy(GRID)
     points = [(0.1, 0.1, 10.5), (1.1, 0.1, 20.0), (2.1, 0.1, 0.0)]
-    assert world.fuse_points(points, ground_m=[10.0, 20.0, math.nan]) == 2
+    assert world.fuse_points(points, ground_m=[10.0, 20.0, math.nan]).cells == 2
     assert world.cells()[16, [20, 24, 28]].tolist() == [70, 45, -1]
     assert world.ignored[Ignored.NAN] == 1
-    assert world.fuse_points(np.empty((0, 3))) == 0
-    assert world.fuse_points([(0.1, 0.1, 1e308), (0.1, 0.1, math.inf)], ground_m=[-1e308, math.inf]) == 0
+    assert world.fuse_points(np.empty((0, 3))).cells == 0
+    assert world.fuse_points([(0.1, 0.1, 1e308), (0.1, 0.1, math.inf)], ground_m=[-1e308, math.inf]).cells == 0
     with pytest.raises(UsageError, match=r"a ground of \(2,\) below 3 points"):
         world.fuse_points(points, ground_m=[1.0, 2.0])
     with pytest.raises(UsageError, match="a row of x, y, z"):

@@ -1,0 +1,181 @@
+"""Where the twin and what a robot sees do not agree: things in the twin that are not there, and things that are.
+
+Each cell keeps what the last scans said that saw it. What they say, the twin may be a match radius off: the twin's
+place of a wall, the cells' size and the robot's own pose are. What is left is joined into discrepancies, each with a
+number that it keeps while it lasts. The robot's own sensors are right, always: the twin is what is to be corrected.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from sern_core.vocabulary.errors import UsageError
+from sern_twin.world.grid import Grid, need_cells
+from sern_twin.world.patches import FREE, OCCUPIED, Cells
+
+SCANS: Final = 5
+"""What so many of the last scans said that saw a cell."""
+AGREEING: Final = 3
+"""So many of them decide."""
+RADIUS_CELLS: Final = 2
+"""The match radius at the least."""
+POSE_ERRORS: Final = 2.0
+"""The match radius is so many times how far off the robot's pose may be."""
+LEAST_CELLS: Final = 2
+"""One cell alone is not said: it flickers at the edges of things."""
+MOST: Final = 64
+"""The largest are said where there are more."""
+Mask = NDArray[np.bool_]
+_ALL_AROUND: Final = np.ones((3, 3), np.bool_)
+_LAST: Final = (1 << SCANS) - 1
+_COUNTS: Final = np.array([number.bit_count() for number in range(_LAST + 1)], np.uint8)
+
+
+class DiscrepancyKind(StrEnum):
+    PHANTOM = "phantom"
+    """The twin has something where scans see through."""
+    UNKNOWN_OBSTACLE = "unknown_obstacle"
+    """Scans see something where the twin says that it is free."""
+
+
+@dataclass(frozen=True, slots=True)
+class Discrepancy:
+    """`number` is the same while it lasts. `east_m`, `north_m`: its middle; `radius_m`: of the circle around it, about
+    the middle. `since_s`: when it was found, by the clock of `compare`."""
+
+    number: int
+    kind: DiscrepancyKind
+    east_m: float
+    north_m: float
+    radius_m: float
+    cells: int
+    since_s: float
+
+
+class Discrepancies:
+    """`saw` with each scan, `compare` with the twin as often as it is to be known. `left_out` counts those beyond
+    `MOST` in the last comparison."""
+
+    def __init__(self, grid: Grid) -> None:
+        self._grid = grid
+        self._ends: NDArray[np.uint8] = np.zeros(grid.shape, np.uint8)
+        """A bit for each of the last scans that saw the cell: a ray ended in it. The newest is the lowest."""
+        self._passes: NDArray[np.uint8] = np.zeros(grid.shape, np.uint8)
+        """The same: a ray passed."""
+        self._found: dict[DiscrepancyKind, Mask] = {kind: np.zeros(grid.shape, np.bool_) for kind in DiscrepancyKind}
+        self._now: list[tuple[Discrepancy, NDArray[np.int64]]] = []
+        self._numbers = 0
+        self.left_out = 0
+
+    def saw(self, free: Mask, occupied: Mask) -> None:
+        """One scan: through which cells it saw, and in which it ended, (rows, columns) each.
+
+        UsageError: another shape than the grid's.
+        """
+        if free.shape != self._grid.shape or occupied.shape != self._grid.shape:
+            raise UsageError(f"a scan of {free.shape} and {occupied.shape} cells on a grid of {self._grid.shape}")
+        seen = free | occupied
+        for bits, said in ((self._ends, occupied), (self._passes, free & ~occupied)):
+            bits[seen] = (bits[seen] << 1 | said[seen]) & _LAST
+
+    @property
+    def occupied(self) -> Mask:
+        """Cells in which the last scans ended, mostly."""
+        return _COUNTS[self._ends] >= AGREEING
+
+    @property
+    def clear(self) -> Mask:
+        """Cells through which the last scans saw, mostly."""
+        return _COUNTS[self._passes] >= AGREEING
+
+    def cells(self, kind: DiscrepancyKind) -> Mask:
+        """Cells of all discrepancies of a kind, as of the last comparison, single ones too."""
+        return self._found[kind].copy()
+
+    def unobserved(self, twin: Cells) -> Mask:
+        """Cells that the twin has something in, and of which the scans say nothing."""
+        need_cells(twin, self._grid.shape, "a twin")
+        unseen: Mask = (twin >= OCCUPIED) & ~self.occupied & ~self.clear
+        return unseen
+
+    def compare(self, twin: Cells, *, now_s: float, pose_error_m: float = 0.0) -> tuple[Discrepancy, ...]:
+        """What is not as the twin has it, (rows, columns); unknown cells of the twin are no discrepancy.
+
+        UsageError: cells that are not the grid's, a pose error that is below 0 or not finite.
+        """
+        need_cells(twin, self._grid.shape, "a twin")
+        if not 0 <= pose_error_m < np.inf:
+            raise UsageError(f"a pose error of {pose_error_m} m")
+        has, occupied = twin >= OCCUPIED, self.occupied
+        radius_cells = max(float(RADIUS_CELLS), POSE_ERRORS * pose_error_m / self._grid.cell_m)
+        self._found = {
+            DiscrepancyKind.PHANTOM: _beyond(has & self.clear, occupied, radius_cells),
+            DiscrepancyKind.UNKNOWN_OBSTACLE: _beyond((twin == FREE) & occupied, has, radius_cells),
+        }
+        found = [each for kind, mask in self._found.items() for each in self._joined(kind, mask, now_s)]
+        found.sort(key=lambda each: -each[0].cells)
+        self.left_out = max(0, len(found) - MOST)
+        self._now = self._numbered(found[:MOST])
+        return tuple(discrepancy for discrepancy, _cells in self._now)
+
+    def _joined(self, kind: DiscrepancyKind, mask: Mask, now_s: float) -> list[tuple[Discrepancy, NDArray[np.int64]]]:
+        """Cells that touch, or have two others between them at the most, are one thing."""
+        if not mask.any():
+            return []
+        labels, count = ndimage.label(ndimage.binary_dilation(mask, _ALL_AROUND), _ALL_AROUND)
+        labels[~mask] = 0
+        found = []
+        for label, window in enumerate(ndimage.find_objects(labels, count), start=1):
+            assert window is not None
+            rows, columns = np.nonzero(labels[window] == label)
+            if len(rows) < LEAST_CELLS:
+                continue
+            rows, columns = rows + window[0].start, columns + window[1].start
+            places = self._grid.centres(rows, columns)
+            middle = places.mean(axis=0)
+            radius_m = float(np.hypot(*(places - middle).T).max()) + self._grid.cell_m / 2
+            thing = Discrepancy(0, kind, float(middle[0]), float(middle[1]), radius_m, len(rows), now_s)
+            found.append((thing, rows * self._grid.columns + columns))
+        return found
+
+    def _numbered(
+        self, found: Sequence[tuple[Discrepancy, NDArray[np.int64]]]
+    ) -> list[tuple[Discrepancy, NDArray[np.int64]]]:
+        """Each takes the number of the one before with which it has the most cells in common."""
+        left = list(self._now)
+        made = []
+        for thing, cells in found:
+            shared = [
+                np.isin(cells, before, assume_unique=True).sum() if known.kind is thing.kind else 0
+                for known, before in left
+            ]
+            if shared and max(shared) > 0:
+                known, _before = left.pop(int(np.argmax(shared)))
+                made.append((replace(thing, number=known.number, since_s=known.since_s), cells))
+            else:
+                self._numbers += 1
+                made.append((replace(thing, number=self._numbers), cells))
+        return made
+
+
+def _beyond(cells: Mask, others: Mask, radius_cells: float) -> Mask:
+    """Those cells that are further than the radius from all others."""
+    if not cells.any() or not others.any():
+        return cells
+    rows, columns = (_window(np.flatnonzero(cells.any(axis=1 - axis)), radius_cells) for axis in (0, 1))
+    near = others[rows, columns]
+    found = np.zeros_like(cells)
+    found[rows, columns] = cells[rows, columns]
+    if near.any():
+        found[rows, columns] &= ndimage.distance_transform_edt(~near) > radius_cells
+    return found
+
+
+def _window(places: NDArray[np.int64], radius_cells: float) -> slice:
+    margin = int(radius_cells) + 1
+    return slice(max(0, int(places[0]) - margin), int(places[-1]) + margin + 1)
