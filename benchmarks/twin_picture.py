@@ -10,6 +10,7 @@ import io
 import math
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,13 +18,14 @@ import numpy as np
 
 from sern_client.endpoints.twin import bodies
 from sern_client.endpoints.twin.endpoint import TwinEndpoint
-from sern_client.endpoints.twin.options import RobotOptions, TwinOptions, ViewOptions
+from sern_client.endpoints.twin.options import FrameOrigin, RobotOptions, TwinOptions, ViewOptions
 from sern_client.endpoints.twin.view.blocks import boxes
 from sern_core.vocabulary.errors import SernError
 from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 from sern_tools.harness.browser import opened
 from sern_twin.motion import Motion, Twist
+from sern_twin.world.discrepancy import DiscrepancyKind, SeenDiscrepancy
 from sern_twin.world.grid import Grid
 from sern_twin.world.patches import OCCUPIED
 
@@ -39,6 +41,10 @@ RADIUS_M: Final = 9.0
 WALLS: Final = ((-6.0, 18.0, 18.0, 0.5), (11.5, 4.0, 0.5, 14.0))
 THINGS: Final = ((-2.0, 6.0, 1.5, 1.0), (2.5, 9.0, 1.0, 1.0), (7.5, 2.0, 1.5, 1.0))
 """East, north, width and length in metres."""
+WRONG: Final = (
+    SeenDiscrepancy("", "jackal2", DiscrepancyKind.PHANTOM, 8.25, 2.5, 1.0, 24),
+    SeenDiscrepancy("", "jackal2", DiscrepancyKind.UNKNOWN_OBSTACLE, 4.0, 4.5, 0.6, 9),
+)
 ROBOTS: Final = (RobotOptions("jackal1", "/jackal1/odom", "/jackal1/plan"), RobotOptions("jackal2", "/jackal2/odom"))
 
 
@@ -58,9 +64,10 @@ def straight(time_s: float) -> Motion:
 class World:
     """The twins of two robots, in time that is made."""
 
-    def __init__(self, view: ViewOptions | None = None) -> None:
+    def __init__(self, view: ViewOptions | None = None, *, origin: FrameOrigin | None = None) -> None:
         self.now = 0.0
-        self.endpoint = TwinEndpoint(TwinOptions(ROBOTS, view=view), now=lambda: self.now, wall_ns=lambda: 0)
+        robots = ROBOTS if origin is None else tuple(replace(each, origin=origin) for each in ROBOTS)
+        self.endpoint = TwinEndpoint(TwinOptions(robots, view=view), now=lambda: self.now, wall_ns=lambda: 0)
         self.endpoint.show_link(lambda: LINK)
         self._writer = bodies.Writer(Encoding.CDR)
         self._heard: dict[str, Any] = {}
@@ -127,7 +134,7 @@ async def photograph(out: Path) -> None:
                 while not page.watched:  # noqa: ASYNC110  (its thread tells nobody)
                     await asyncio.sleep(0.1)
                 page.blocks(boxes(*yard()))
-                page.draw(Picture(world.endpoint.snapshot(), 0.0, 600.0))
+                page.draw(Picture(world.endpoint.snapshot(), 0.0, 600.0, WRONG))
                 before = b""
                 while (picture := await tab.picture()) != before:  # until it stands still
                     before = picture

@@ -81,9 +81,12 @@ def _resolved(value: str | Sequence[str] | None, resolve: Resolve) -> Path | tup
 
 def _twin(section: TwinEndpoint, resolve: Resolve) -> Endpoint:
     from sern_client.endpoints.twin.endpoint import TwinEndpoint
-    from sern_client.endpoints.twin.options import RobotOptions, TwinOptions, ViewOptions
+    from sern_client.endpoints.twin.options import FrameOrigin, RobotOptions, TwinOptions, ViewOptions
 
-    robots = tuple(RobotOptions(**robot.model_dump()) for robot in section.robots)
+    robots = tuple(
+        RobotOptions(**robot.model_dump(exclude={"origin"}), origin=FrameOrigin(**robot.origin.model_dump()))
+        for robot in section.robots
+    )
     view = None
     if section.view is not None:
         if not sections.installed("viser"):

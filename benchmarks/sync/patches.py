@@ -28,7 +28,7 @@ from sern_twin.world.patches import OCCUPIED, Refusal, read_header
 from tests.world import SimClient, World, spec
 
 GRID: Final = Grid(-12.0, -12.0, 0.1, 240, 240, frame_id="odom")
-OPTIONS: Final = SceneOptions("yard", publish=None)
+OPTIONS: Final = SceneOptions("yard")
 THIN: Final = LinkModel(rate_bps=256_000.0, delay_s=0.05)
 POSE_HZ: Final = 20.0
 POSE_BYTES: Final = 724
@@ -125,7 +125,8 @@ def drive(
         found = pilot.step()  # where the localisation has it at the scan
         for _ in range(round(PERIOD_S / STEP_S) - 1):
             pilot.step()
-        robot.node.fuse([Placed((found.pose.x_m, found.pose.y_m, found.pose.yaw_rad), scan)])
+        placed = Placed((found.pose.x_m, found.pose.y_m, found.pose.yaw_rad), scan)
+        robot.node.fuse([placed], robot.node.twin_cells())
         robot.node.tick(seen=True)
 
     return world.network.every(PERIOD_S, turn, node=robot.client).cancel

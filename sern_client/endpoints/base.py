@@ -19,9 +19,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sern_runtime.metrics import Metrics
+    from sern_twin.world.discrepancy import SeenDiscrepancy
     from sern_twin.world.grid import Grid
     from sern_twin.world.mesh import Mesh
     from sern_twin.world.patches import Cells
+    from sern_twin.world.terrain import Terrain
 
 GUARD_SUFFIX: Final = "_guard"
 """What the node of a client's guard (sern_client/guard.py) has behind the name of the client's own node. It publishes
@@ -229,6 +231,20 @@ class ObjectEndpoint(Protocol):
         """Once, before `start`."""
 
 
+@runtime_checkable
+class OfferingEndpoint(Protocol):
+    """An endpoint that has no ROS behind it: what its client makes itself goes out to all sites as a topic of it."""
+
+    @property
+    def prefix(self) -> str:
+        """Under which name its topics are."""
+        ...
+
+    def offer(self, info: TopicInfo) -> Publisher:
+        """Announce a topic of its client. ConfigError: it has that name already."""
+        ...
+
+
 class SceneShown(Protocol):
     """A scene for whoever draws it."""
 
@@ -238,6 +254,11 @@ class SceneShown(Protocol):
     @property
     def ground(self) -> "Mesh | None":
         """The ground and what stands on it; None: it is not known."""
+        ...
+
+    @property
+    def terrain(self) -> "Terrain | None":
+        """The heights of the ground; None: they are not known."""
         ...
 
     @property
@@ -251,6 +272,10 @@ class SceneShown(Protocol):
 
     def ages_s(self) -> "NDArray[np.float64]":
         """Seconds since each block was changed, (blocks,); NaN: it is as the map of the site has it."""
+        ...
+
+    def discrepancies(self) -> "tuple[SeenDiscrepancy, ...]":
+        """Where scanners see something else than the twin has."""
         ...
 
 

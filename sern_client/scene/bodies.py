@@ -1,7 +1,9 @@
 """Messages about a scene: scans and markers in, occupancy grids and their updates out."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -10,19 +12,37 @@ from sern_client.endpoints.twin.bodies import ODOMETRY, read_message, stamp_of
 from sern_core.vocabulary.errors import BodyError
 from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
+from sern_twin.world.discrepancy import DiscrepancyKind, SeenDiscrepancy
 from sern_twin.world.grid import Floats, Grid
 from sern_twin.world.patches import Cells
 
 SCAN: Final = "sensor_msgs/msg/LaserScan"
 MARKER: Final = "visualization_msgs/msg/Marker"
+MARKERS: Final = "visualization_msgs/msg/MarkerArray"
 GRID: Final = "nav_msgs/msg/OccupancyGrid"
 UPDATE: Final = "map_msgs/msg/OccupancyGridUpdate"
 MOST_SCAN_BYTES: Final = 512 * 1024
 CORNERS: Final = 16
 """A cylinder's outline has so many."""
-_CUBE, _SPHERE, _CYLINDER = 1, 2, 3
+COLOURS: Final = {DiscrepancyKind.PHANTOM: (0.58, 0.2, 0.83), DiscrepancyKind.UNKNOWN_OBSTACLE: (0.86, 0.15, 0.15)}
+"""Red, green and blue of a discrepancy."""
+HEIGHT_M: Final = 1.0
+_CUBE, _SPHERE, _CYLINDER, _TEXT = 1, 2, 3, 9
 _ADD, _DELETE, _DELETE_ALL = 0, 2, 3
-__all__ = ["GRID", "MARKER", "ODOMETRY", "SCAN", "UPDATE", "Marker", "Scan", "Writer", "read_marker", "read_scan"]
+__all__ = [
+    "COLOURS",
+    "GRID",
+    "MARKER",
+    "MARKERS",
+    "ODOMETRY",
+    "SCAN",
+    "UPDATE",
+    "Marker",
+    "Scan",
+    "Writer",
+    "read_marker",
+    "read_scan",
+]
 
 
 class Scan(NamedTuple):
@@ -91,8 +111,6 @@ class Writer:
     def whole(self, cells: Cells, *, stamp_ns: int) -> bytes:
         """A nav_msgs/OccupancyGrid of all cells."""
         grid, encoding = self._grid, self._encoding
-        point = ros_types.new("geometry_msgs/msg/Point", encoding, x=grid.west_m, y=grid.south_m)
-        turn = ros_types.new("geometry_msgs/msg/Quaternion", encoding, w=1.0)
         info = ros_types.new(
             "nav_msgs/msg/MapMetaData",
             encoding,
@@ -100,7 +118,7 @@ class Writer:
             resolution=grid.cell_m,
             width=grid.columns,
             height=grid.rows,
-            origin=ros_types.new("geometry_msgs/msg/Pose", encoding, position=point, orientation=turn),
+            origin=self._upright(grid.west_m, grid.south_m, 0.0),
         )
         header = self._header(stamp_ns)
         message = ros_types.new(GRID, encoding, header=header, info=info, data=cells.reshape(-1))
@@ -121,6 +139,40 @@ class Writer:
             data=part.reshape(-1),
         )
         return ros_types.serialise(message, UPDATE, self._encoding)
+
+    def discrepancies(self, found: Sequence[SeenDiscrepancy], *, stamp_ns: int) -> bytes:
+        """A visualization_msgs/MarkerArray of all there are, which takes the place of the one before: of each a
+        cylinder, whose namespace is its kind, and its words."""
+        header = self._header(stamp_ns)
+        new = partial(ros_types.new, MARKER, self._encoding, header=header)
+        markers = [new(action=_DELETE_ALL)]
+        for number, thing in enumerate(found):
+            red, green, blue = COLOURS[thing.kind]
+            for shape, namespace, up_m, size, alpha, text in (
+                (_CYLINDER, thing.kind.value, HEIGHT_M / 2, (2 * thing.radius_m, HEIGHT_M), 0.5, ""),
+                (_TEXT, f"{thing.kind.value}_text", HEIGHT_M + 0.2, (0.0, 0.3), 1.0, thing.says),
+            ):
+                markers.append(
+                    new(
+                        ns=namespace,
+                        id=number,
+                        type=shape,
+                        action=_ADD,
+                        pose=self._upright(thing.east_m, thing.north_m, up_m),
+                        scale=ros_types.new(
+                            "geometry_msgs/msg/Vector3", self._encoding, x=size[0], y=size[0], z=size[1]
+                        ),
+                        color=ros_types.new("std_msgs/msg/ColorRGBA", self._encoding, r=red, g=green, b=blue, a=alpha),
+                        text=text,
+                    )
+                )
+        return ros_types.serialise(ros_types.new(MARKERS, self._encoding, markers=markers), MARKERS, self._encoding)
+
+    def _upright(self, x_m: float, y_m: float, z_m: float) -> Any:
+        encoding = self._encoding
+        point = ros_types.new("geometry_msgs/msg/Point", encoding, x=x_m, y=y_m, z=z_m)
+        turn = ros_types.new("geometry_msgs/msg/Quaternion", encoding, w=1.0)
+        return ros_types.new("geometry_msgs/msg/Pose", encoding, position=point, orientation=turn)
 
     def _header(self, stamp_ns: int) -> Any:
         self._seq = (self._seq + 1) & 0xFFFFFFFF

@@ -30,7 +30,7 @@ class Unused(StrEnum):
     SUPERSEDED = "superseded"
     """A scan before the last one of a turn."""
     FULL = "full"
-    """There are too many obstacles."""
+    """There are too many obstacles, or discrepancies of other sites."""
     UNREADABLE = "unreadable"
 
 

@@ -4,7 +4,7 @@ import logging
 import math
 from typing import TYPE_CHECKING, Final
 
-from sern_client.endpoints.base import Endpoint, SiteObjects
+from sern_client.endpoints.base import Endpoint, OfferingEndpoint, SiteObjects
 from sern_client.site import Site
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.types import Encoding
@@ -12,7 +12,6 @@ from sern_runtime.config.client import ClientFile
 from sern_runtime.config.endpoints import installing
 from sern_runtime.config.load import Loaded
 from sern_runtime.config.scene import SceneSection
-from sern_runtime.config.twin import TwinEndpoint
 
 if TYPE_CHECKING:
     from sern_client.scene.node import SceneNode
@@ -20,7 +19,10 @@ if TYPE_CHECKING:
     from sern_twin.world.mesh import Mesh
     from sern_twin.world.patches import Cells
     from sern_twin.world.primitives import Primitive
+    from sern_twin.world.terrain import Terrain
 
+PUBLISHED: Final = {"publish": "map", "discrepancies": "discrepancies"}
+"""What a scene publishes, by the key of the file that names its topic; what sern-twin calls it."""
 GROUND_CELLS: Final = 200
 """The ground is shown with so many cells along a side: 80,000 triangles at the most."""
 
@@ -57,19 +59,27 @@ def make_scene(
     except UsageError as error:
         raise ConfigError(str(error), file=str(loaded.path), key="scene") from error
     things = _things(loaded, section, grid)
+    ground, terrain = _ground(loaded, section, grid, things or [])
     scanners = tuple(ScannerOptions(**each.model_dump()) for each in section.scanners)
-    twins_alone = all(isinstance(each, TwinEndpoint) for each in loaded.model.endpoints)  # which take no map
-    publish = None if twins_alone else section.publish
-    options = SceneOptions(section.name, scanners, section.obstacles, publish)
+    names, advertise = {key: getattr(section, key) for key in PUBLISHED}, site.advertise
+    if isinstance(endpoint, OfferingEndpoint):  # the twins', which publishes for all sites
+        advertise = endpoint.offer
+        names = {key: f"{endpoint.prefix}/scene/{part}" for key, part in PUBLISHED.items()}
+        for key in sorted(names.keys() & section.model_fields_set):
+            raise ConfigError(
+                f"sern-twin publishes it as {names[key]}: remove the line", file=str(loaded.path), key=f"scene.{key}"
+            )
+    options = SceneOptions(section.name, scanners, section.obstacles, **names)
     return SceneNode(
         options,
         grid,
         loaded.model.name,
         base=None if things is None else _base(things, grid),
-        ground=_ground(loaded, section, grid, things or []),
+        ground=ground,
+        terrain=terrain,
         encoding=encoding,
         subscribe=endpoint.subscribe,
-        advertise=site.advertise,
+        advertise=advertise,
         objects=objects,
     )
 
@@ -100,15 +110,15 @@ def _base(things: "list[Primitive]", grid: "Grid") -> "Cells":
 
 def _ground(
     loaded: Loaded[ClientFile], section: SceneSection, grid: "Grid", things: "list[Primitive]"
-) -> "Mesh | None":
-    """The ground of the site and the buildings on it, to be looked at; None: neither is known."""
+) -> "tuple[Mesh | None, Terrain | None]":
+    """The ground of the site and the buildings on it, to be looked at, and its heights; None: not known."""
     if section.terrain is None and not things:
-        return None
+        return None, None
     from sern_twin.world.mesh import joined
     from sern_twin.world.primitives import building_mesh
 
     if section.terrain is None:
-        return building_mesh(things)
+        return building_mesh(things), None
     from sern_runtime.geodata import read_elevation
     from sern_twin.world.terrain import resampled
 
@@ -120,4 +130,4 @@ def _ground(
     left_out = terrain.resampling
     _log.info("scene: the ground of %s, %d cells of it outside", path.name, left_out.outside)
     step = max(1, math.ceil(max(grid.shape) / GROUND_CELLS))
-    return joined([terrain.mesh(step), building_mesh(things, terrain)])
+    return joined([terrain.mesh(step), building_mesh(things, terrain)]), terrain

@@ -4,7 +4,8 @@ it together is a map on a topic of this site.
 Each block of each layer is an object `/scene/NAME/LAYER/BLOCK@CLIENT` of kind patch, whose value is the whole block as
 it is now (`sern_twin.world.patches`): whoever missed one is right with the next, and after a blackout only blocks that
 have changed are told. The map is nav_msgs/OccupancyGrid, latched, and what changes in it map_msgs/OccupancyGridUpdate:
-the static layer of a costmap takes both.
+the static layer of a costmap takes both. Where scanners see something else than the twin has is told beside it
+(`differing.py`).
 """
 
 import asyncio
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from sern_client.endpoints.base import Held, Publisher, Sink, SiteObjects, Subscription
 from sern_client.endpoints.common.saying import SayOnce
 from sern_client.scene import bodies
+from sern_client.scene.differing import SceneDiscrepancies
 from sern_client.scene.hearing import Obstacles, Placed, Scanner, Unused
 from sern_client.scene.options import SceneOptions
 from sern_core.objects.xr_object import XrObject
@@ -30,18 +32,22 @@ from sern_core.vocabulary.names import plain_type
 from sern_core.vocabulary.types import Encoding, ObjectKind, TopicName
 from sern_runtime import clock, ros_types
 from sern_runtime.metrics import Metrics
+from sern_twin.world.discrepancy import DiscrepancyKind, SeenDiscrepancy
 from sern_twin.world.grid import Grid
 from sern_twin.world.mesh import Mesh
-from sern_twin.world.occupancy import Occupancy
+from sern_twin.world.occupancy import Occupancy, Sight
 from sern_twin.world.offset import object_offset
 from sern_twin.world.patches import LAYERS, OCCUPIED, UNKNOWN, BlockKey, Cells, Refusal, read_header
 from sern_twin.world.scene import Scene
+from sern_twin.world.terrain import Terrain
 
 PERIOD_S: Final = 0.1
 WHOLE_S: Final = 5.0
 """How often the whole map is published at most: to who comes late, the last one is latched."""
 MOST_UPDATES: Final = 64
 """Where more blocks change at once, the whole map is published."""
+DISCREPANCIES_S: Final = 0.5
+"""How often discrepancies are published at most."""
 OFFSETS_S: Final = 1.0
 OFFSET_RADIUS_M: Final = 0.5
 """How far from where it was added an obstacle is looked for in what is seen."""
@@ -64,6 +70,7 @@ class SceneNode:
         *,
         base: Cells | None,
         ground: Mesh | None = None,
+        terrain: Terrain | None = None,
         encoding: Encoding,
         subscribe: Callable[[TopicName, Sink], Subscription],
         advertise: Callable[[TopicInfo], Publisher],
@@ -77,6 +84,7 @@ class SceneNode:
         self.occupancy = Occupancy(grid)
         self.ground = ground
         """The ground and what stands on it, for who looks at it."""
+        self.terrain = terrain
         self.unused: Counter[Unused] = Counter()
         self.offsets_m: dict[str, float] = {}
         """How far what is seen of an obstacle is from where it was added, by its marker."""
@@ -88,6 +96,7 @@ class SceneNode:
         self._wall_ns = wall_ns
         self._prefix = f"/scene/{options.name}/"
         self._scanners = [Scanner(each, grid, self.unused) for each in options.scanners]
+        self._pose_error_m = max((each.pose_error_m for each in options.scanners), default=0.0)
         self.obstacles = Obstacles(grid, self.unused)
         self._writer = bodies.Writer(grid, encoding)
         self._encoding = encoding
@@ -101,6 +110,12 @@ class SceneNode:
         self._whole = True
         self._offsets_due_s = now()
         self._said = SayOnce(_log)
+        self.differing = SceneDiscrepancies(
+            options.name, client, grid, objects,
+            unused=self._unused, said=lambda text: self._said(f"scene: {text}", text),
+        )  # fmt: skip
+        self._differing_due_s = now()
+        self._differing_changes = 0
         if base is not None:
             self.scene.set_cells("base", base)
         objects.listen(self)
@@ -154,6 +169,9 @@ class SceneNode:
     # --- objects of others --------------------------------------------------------------------------------------------
 
     def changed(self, item: XrObject) -> None:
+        if item.kind is ObjectKind.DISCREPANCY and item.id.startswith(self.differing.prefix):
+            self.differing.changed(item)
+            return
         if item.kind is not ObjectKind.PATCH or item.value is None or not item.id.startswith(self._prefix):
             return
         header = read_header(self.grid, item.value)
@@ -169,6 +187,7 @@ class SceneNode:
             self._change(header.key)
 
     def deleted(self, object_id: str) -> None:
+        self.differing.deleted(object_id)
         key = self._key(object_id)
         if key is not None and key.writer != self._client and self.scene.withdraw(key):
             self._change(key)
@@ -190,17 +209,22 @@ class SceneNode:
             await asyncio.sleep(PERIOD_S)
             placed = self.take()
             if placed:  # takes milliseconds: not where poses and commands wait
-                await asyncio.to_thread(self.fuse, placed)
+                await asyncio.to_thread(self.fuse, placed, self.twin_cells())
             self.tick(seen=bool(placed))
 
     def take(self) -> list[Placed]:
         """What scanners have seen since the last call."""
         return [placed for scanner in self._scanners if (placed := scanner.take()) is not None]
 
-    def fuse(self, placed: list[Placed]) -> None:
-        """Have scans change the occupancy. Nobody else touches that meanwhile."""
-        for pose, scan in ((each.pose, each.scan) for each in placed):
-            self.occupancy.fuse(pose, scan.angles_rad, scan.ranges_m, scan.most_m, range_min_m=scan.least_m)
+    def fuse(self, placed: list[Placed], twin: Cells) -> None:
+        """Have scans change the occupancy, and compare them with the twin. Nobody else touches either meanwhile."""
+        sights: list[Sight] = [
+            self.occupancy.fuse(
+                each.pose, each.scan.angles_rad, each.scan.ranges_m, each.scan.most_m, range_min_m=each.scan.least_m
+            )
+            for each in placed
+        ]
+        self.differing.saw(sights, twin, now_s=self._now(), pose_error_m=self._pose_error_m)
 
     def tick(self, *, seen: bool) -> None:
         """Tell the others what has changed here, and this site what has changed anywhere."""
@@ -216,7 +240,9 @@ class SceneNode:
             except (RefusedError, UsageError) as error:
                 self._said(f"scene: {error}", type(error).__name__)
         now = self._now()
+        self.differing.tell(now)
         self._publish(now)
+        self._publish_discrepancies(now)
         if now >= self._offsets_due_s:
             self._offsets_due_s = now + OFFSETS_S
             self._measure()
@@ -231,8 +257,19 @@ class SceneNode:
 
     def cells(self) -> Cells:
         """All layers together: what is added over what is seen over what the map says."""
-        found = self.scene.merged("base")
-        for layer in LAYERS[1:]:
+        return self._together(LAYERS)
+
+    def twin_cells(self) -> Cells:
+        """What the twin has without what is seen: what is added over what the map says."""
+        return self._together(tuple(layer for layer in LAYERS if layer != "live"))
+
+    def discrepancies(self) -> tuple[SeenDiscrepancy, ...]:
+        """Where scanners of any site see something else than the twin has."""
+        return self.differing.all()
+
+    def _together(self, layers: tuple[str, ...]) -> Cells:
+        found = self.scene.merged(layers[0])
+        for layer in layers[1:]:
             over = self.scene.merged(layer)
             known = over != UNKNOWN
             found[known] = over[known]
@@ -249,9 +286,6 @@ class SceneNode:
         self.changes += 1
 
     def _publish(self, now: float) -> None:
-        if self.options.publish is None:
-            self._changed.clear()
-            return
         if not self._changed and not (self._whole and now >= self._whole_due_s):
             return
         cells, stamp_ns = self.cells(), self._wall_ns()
@@ -266,11 +300,19 @@ class SceneNode:
                 self._say(f"{self.options.publish}_updates", bodies.UPDATE, update, stamp_ns)
         self._changed.clear()
 
+    def _publish_discrepancies(self, now: float) -> None:
+        if self.differing.changes == self._differing_changes or now < self._differing_due_s:
+            return
+        self._differing_changes, self._differing_due_s = self.differing.changes, now + DISCREPANCIES_S
+        stamp_ns = self._wall_ns()
+        body = self._writer.discrepancies(self.differing.all(), stamp_ns=stamp_ns)
+        self._say(self.options.discrepancies, bodies.MARKERS, body, stamp_ns)
+
     def _say(self, topic: str, type_name: str, body: bytes, stamp_ns: int) -> None:
         name = TopicName(topic)
         publisher = self._publishers.get(name)
         if publisher is None:
-            info = ros_types.topic_info(topic, type_name, self._encoding, latched=type_name == bodies.GRID)
+            info = ros_types.topic_info(topic, type_name, self._encoding, latched=type_name != bodies.UPDATE)
             try:
                 publisher = self._publishers[name] = self._advertise(info)
             except ConfigError as error:
@@ -311,7 +353,23 @@ class SceneNode:
             "ignored_readings": {reason.value: count for reason, count in self.occupancy.ignored.items()},
             "obstacles": len(self.obstacles.markers),
             "offsets_m": dict(self.offsets_m),
+            "discrepancies": [
+                {
+                    "id": each.object_id,
+                    "seen_by": each.owner,
+                    "kind": each.kind.value,
+                    "east_m": each.east_m,
+                    "north_m": each.north_m,
+                    "radius_m": each.radius_m,
+                    "cells": each.cells,
+                }
+                for each in self.differing.all()
+            ],
+            "discrepancies_left_out": self.differing.left_out,
         }
+
+    def _unused(self, reason: Unused) -> None:
+        self.unused[reason] += 1
 
     def register(self, metrics: Metrics) -> None:
         metrics.counter(
@@ -330,6 +388,15 @@ class SceneNode:
             "sern_scene_blocks",
             "Blocks of the scene that something is known of, of all layers and writers.",
             read=lambda: [((), float(len(self.scene.versions())))],
+        )
+        metrics.gauge(
+            "sern_scene_discrepancies",
+            "Where scanners of any site see something else than the twin has, by kind.",
+            ("kind",),
+            lambda: [
+                ((kind.value,), float(sum(each.kind is kind for each in self.differing.all())))
+                for kind in DiscrepancyKind
+            ],
         )
         metrics.gauge(
             "sern_scene_offset_metres",

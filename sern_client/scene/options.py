@@ -10,6 +10,7 @@ class ScannerOptions:
     x_m: float = 0.0
     y_m: float = 0.0
     yaw_rad: float = 0.0
+    pose_error_m: float = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,5 +18,5 @@ class SceneOptions:
     name: str
     scanners: tuple[ScannerOptions, ...] = ()
     obstacles: str | None = None
-    publish: str | None = "/scene/map"
-    """None: there is nowhere to publish it."""
+    publish: str = "/scene/map"
+    discrepancies: str = "/scene/discrepancies"

@@ -61,6 +61,7 @@ class ObjectKind(StrEnum):
     OBSTACLE = "obstacle"
     TERRAIN = "terrain"
     PATCH = "patch"
+    DISCREPANCY = "discrepancy"
     COMMAND = "command"
 
 

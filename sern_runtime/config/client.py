@@ -431,7 +431,9 @@ class ActionsSection(Section):
 class ObjectSelection(Section):
     """Cross-reality objects of others that this site wants."""
 
-    kind: Literal["topic", "transform", "node", "robot", "obstacle", "terrain", "patch", "command"] | None = None
+    kind: (
+        Literal["topic", "transform", "node", "robot", "obstacle", "terrain", "patch", "discrepancy", "command"] | None
+    ) = None
     """Only objects of this kind; null: of any."""
     match: Pattern = ".*"
     """Only objects whose whole id matches, such as twin/.* or /jackal1/odom@jackal1."""
@@ -555,11 +557,12 @@ class ClientFile(FileModel):
         return tuple(dict.fromkeys((*self.subscribe, *received, *services, *self.actions.patterns())))
 
     def object_selections(self) -> tuple[Selection, ...]:
-        """What to ask the relay for of objects: `objects`, and the patches of the scene."""
+        """What to ask the relay for of objects: `objects`, and the patches and discrepancies of the scene."""
         selections = tuple(section.selection() for section in self.objects)
         if self.scene is None:
             return selections
-        return (*selections, Selection(ObjectKind.PATCH, f"/scene/{self.scene.name}/.*"))
+        of_scene = (ObjectKind.PATCH, ObjectKind.DISCREPANCY)
+        return (*selections, *(Selection(kind, f"/scene/{self.scene.name}/.*") for kind in of_scene))
 
     def placed(self, base_dir: Path) -> Self:
         relay = self.relay.model_copy(update={"endpoint": place(base_dir, self.relay.endpoint)})

@@ -27,6 +27,8 @@ class ScannerSection(Section):
     """To the left of it."""
     yaw_rad: Annotated[float, Field(ge=-math.tau, le=math.tau)] = 0.0
     """Which way it looks."""
+    pose_error_m: Annotated[float, Field(ge=0, le=10)] = 0.05
+    """How far off the poses may be: what is seen within twice that of where the twin has it is no discrepancy."""
 
 
 class OriginSection(Section):
@@ -74,7 +76,11 @@ class SceneSection(Section):
     """An elevation model of the site, such as a GeoTIFF: the ground on which the page of sern-twin shows it, with the
     buildings of `base`."""
     publish: TopicText = "/scene/map"
-    """Where the map is published here: nav_msgs/OccupancyGrid, and what changes beside it under NAME_updates."""
+    """Where the map is published here: nav_msgs/OccupancyGrid, and what changes beside it under NAME_updates. sern-twin
+    publishes it for all sites as PREFIX/scene/map."""
+    discrepancies: TopicText = "/scene/discrepancies"
+    """Where it is published what scanners of any site see and the twin does not have, and the other way round:
+    visualization_msgs/MarkerArray. sern-twin publishes it as PREFIX/scene/discrepancies."""
 
     @property
     def columns(self) -> int:

@@ -1,6 +1,7 @@
 """The section of an endpoint of kind `twin`: whose twins to keep, and by what."""
 
 import importlib.util
+import math
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,7 +26,20 @@ from sern_runtime.config.base import (
 from sern_runtime.config.yaml import Loc
 
 SLOW_PARTS: Final = ("path", "status")
+SCENE_PARTS: Final = (("map", PriorityClass.BULK), ("map_updates|discrepancies", PriorityClass.STATE))
+"""What is published of the scene, where the file has one."""
 FAST_PARTS: Final = ("odom", "estimate", "age", "error", "unity")
+
+
+class FrameOrigin(Section):
+    """A place and a direction in the frame of the site."""
+
+    x_m: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
+    """To the east."""
+    y_m: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
+    """To the north."""
+    yaw_rad: Annotated[float, Field(ge=-math.tau, le=math.tau)] = 0.0
+    """From east to north."""
 
 
 class TwinRobot(Section):
@@ -45,6 +59,9 @@ class TwinRobot(Section):
     """The same for turning."""
     gap_s: Annotated[float, Field(gt=0, le=3600)] = 0.5
     """Silence from here on is a gap, which is reported when it ends."""
+    origin: FrameOrigin = FrameOrigin()
+    """Where the origin of its frame is in that of the site, such as where it was switched on: its odometry begins
+    there. The view shows all robots, and the scene, in that of the site; what is published stays in the robot's."""
 
 
 class TwinView(Section):
@@ -119,6 +136,8 @@ class TwinEndpoint(EndpointBase):
                     yield TopicRule(compile_pattern(topic), None, priority, Direction.RECEIVE)
         for parts, priority in ((FAST_PARTS, PriorityClass.CONTROL), (SLOW_PARTS, PriorityClass.STATE)):
             yield TopicRule(compile_pattern(f"{self.prefix}/[^/]*/({'|'.join(parts)})"), None, priority, Direction.SEND)
+        for part, priority in SCENE_PARTS:
+            yield TopicRule(compile_pattern(f"{self.prefix}/scene/({part})"), None, priority, Direction.SEND)
 
     def file_problems(self, base_dir: Path, loc: Loc) -> Iterator[FileProblem]:
         if self.view is not None and importlib.util.find_spec("viser") is None:

@@ -57,6 +57,25 @@ class Discrepancy:
     since_s: float
 
 
+@dataclass(frozen=True, slots=True)
+class SeenDiscrepancy:
+    """A discrepancy as its owner, whose scanners found it, told all sites."""
+
+    object_id: str
+    owner: str
+    kind: DiscrepancyKind
+    east_m: float
+    north_m: float
+    radius_m: float
+    cells: int
+
+    @property
+    def says(self) -> str:
+        if self.kind is DiscrepancyKind.PHANTOM:
+            return f"phantom: {self.owner} sees nothing there"
+        return f"unknown obstacle: {self.owner} sees it"
+
+
 class Discrepancies:
     """`saw` with each scan, `compare` with the twin as often as it is to be known. `left_out` counts those beyond
     `MOST` in the last comparison."""

@@ -2,11 +2,14 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+from scipy import ndimage
 
 from sern_client.daemon import ClientDaemon
 from sern_client.scene.node import SceneNode
-from sern_core.vocabulary.types import Encoding
+from sern_core.vocabulary.types import Encoding, TopicName
+from sern_twin.world.discrepancy import DiscrepancyKind
 from sern_twin.world.patches import OCCUPIED
 from tests.daemons import Json, Lab
 from tests.sern_client.scene.test_scene_node import marker
@@ -43,6 +46,36 @@ async def test_a_robot_and_a_site_share_a_scene(tmp_path: Path) -> None:
         await until(lambda: here.scene.digest("live") == there.scene.digest("live"), "both have the same")
         assert here.unused.keys() <= {"superseded", "no_pose"}
         await until(lambda: not robot.check.found, "nothing differs at the endpoint")
+
+
+async def test_the_twin_publishes_the_scene_and_what_is_wrong_in_it_for_a_site_without_one(tmp_path: Path) -> None:
+    """An operator adds what the robot sees through; somebody else has it from sern-twin, as messages."""
+    twins: Json = {"kind": "twin", "robots": [{"name": "robot1", "pose": "/robot1/odometry/filtered"}]}
+    async with Lab(tmp_path, "robot1", "site", "twin", "other") as lab:
+        await lab.relay()
+        seeing = {"scanners": [{"scan": "/scan", "pose": "/odometry/filtered"}]}
+        robot = await lab.connected(
+            lab.client_file("robot1", ROBOT, scene={**SCENE, **seeing}, discovery={"mode": "manual"})
+        )
+        site = await lab.connected(lab.recorder_file("site", "/nothing", scene=SCENE))
+        twin = await lab.connected(lab.client_file("twin", twins, client={"namespace": "/"}, scene=SCENE))
+        other = await lab.connected(lab.recorder_file("other", "/twin/scene/.*"))
+        assert node_of(twin).options.publish == "/twin/scene/map"
+        here = node_of(robot)
+        await until(lambda: int((here.scene.merged("live") == 0).sum()) > 2000, "the robot has seen the yard")
+        clear = np.argwhere(ndimage.minimum_filter(here.scene.merged("live") == 0, 9))
+        x_m, y_m = (float(value) for value in here.grid.centres(*clear[len(clear) // 2]))
+        node_of(site).obstacles.heard(marker(x_m=x_m, y_m=y_m, size_m=0.5), Encoding.CDR)
+        await until(lambda: any(node_of(twin).discrepancies()), "the twin is told of a phantom")
+        assert {each.kind for each in node_of(twin).discrepancies()} == {DiscrepancyKind.PHANTOM}
+        wanted = [TopicName(f"/twin/scene/{part}") for part in ("map", "discrepancies")]
+        arrived = other.core.received.topics
+        await until(
+            lambda: all(name in arrived and arrived[name].delivered for name in wanted), "a plain site has both"
+        )
+        node_of(site).obstacles.heard(marker(action=3), Encoding.CDR)
+        await until(lambda: not node_of(twin).discrepancies(), "and that it is over")
+        await until(lambda: not twin.check.found, "nothing differs at the endpoint of the twins")
 
 
 @pytest.mark.parametrize(

@@ -135,7 +135,7 @@ async def test_the_twins_are_to_be_seen_with_their_scene_and_the_link(tmp_path: 
         )
         endpoint: TwinEndpoint = endpoint_of(twin, TwinEndpoint)
         assert endpoint.view is not None and endpoint.view.scene is twin.scene
-        assert twin.scene is not None and twin.scene.options.publish is None, "twins take no map"
+        assert twin.scene is not None and twin.scene.options.publish == "/twin/scene/map"
         assert endpoint.snapshot().link.startswith("connected to relay")
         async with aiohttp.ClientSession() as session, session.get(f"http://127.0.0.1:{port}/") as answer:
             assert answer.status == 200 and "<html" in (await answer.text()).lower()

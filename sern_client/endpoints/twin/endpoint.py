@@ -9,6 +9,8 @@ For each robot NAME, under the prefix:
     NAME/path       nav_msgs/Path, where it is going to be
     NAME/unity      geometry_msgs/PoseStamped, the shown twin in Unity's axes, where the file asks for it
     NAME/status     diagnostic_msgs/DiagnosticArray, the same in words, with counts
+
+What the client itself makes, such as the map of its scene, goes out beside them (`offered.py`).
 """
 
 import asyncio
@@ -19,11 +21,21 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-from sern_client.endpoints.base import Difference, Held, SceneShown, Sink, SiteObjects, TopicEvents
+from sern_client.endpoints.base import (
+    Difference,
+    Held,
+    Publisher,
+    SceneShown,
+    Sink,
+    SiteObjects,
+    Subscription,
+    TopicEvents,
+)
 from sern_client.endpoints.common.held import HeldSubscription
 from sern_client.endpoints.common.saying import SayOnce, say_failure
 from sern_client.endpoints.twin import bodies
 from sern_client.endpoints.twin.metrics import register_twins
+from sern_client.endpoints.twin.offered import Offered
 from sern_client.endpoints.twin.options import TwinOptions
 from sern_client.endpoints.twin.robot import RobotTwin
 from sern_client.endpoints.twin.view.frames import Snapshot, robot_frame
@@ -112,6 +124,7 @@ class TwinEndpoint:
                 info = ros_types.topic_info(f"{options.prefix}/{name}/{part}", type_name, self._encoding)
                 self._topics[info.name] = _Topic(info, robot, part)
         self._hearers: list[_Hearer] = []
+        self._offered = Offered(set(self._topics))
         self._said = SayOnce(_log)
         self._drops: Counter[DropReason] = Counter()
         self._objects: SiteObjects | None = None
@@ -136,6 +149,7 @@ class TwinEndpoint:
             await self.view.start()
         for topic in self._topics.values():
             events.topic_added(topic.info)
+        self._offered.announce(events)
         self._task = asyncio.create_task(self._run(), name="twins")
         self._task.add_done_callback(say_failure)
 
@@ -146,8 +160,18 @@ class TwinEndpoint:
         for topic in self._topics.values():
             for subscription in list(topic.subscriptions):
                 subscription.close()
+        self._offered.close()
 
-    def subscribe(self, name: TopicName, sink: Sink) -> _Subscription:
+    @property
+    def prefix(self) -> str:
+        return self._options.prefix
+
+    def offer(self, info: TopicInfo) -> Publisher:
+        return self._offered.offer(info)
+
+    def subscribe(self, name: TopicName, sink: Sink) -> Subscription:
+        if name in self._offered:
+            return self._offered.subscribe(name, sink)
         topic = self._topics.get(name)
         if topic is None:
             raise UsageError(f"{name}: the twins have no such topic")
@@ -195,12 +219,10 @@ class TwinEndpoint:
         """Makes no difference: what nobody subscribes to is not made."""
 
     def validate(self, held: Held) -> list[Difference]:
-        return held.differences(
-            Held(
-                Counter(hearer.name for hearer in self._hearers),
-                Counter(name for name, topic in self._topics.items() for _ in topic.subscriptions),
-            )
-        )
+        offered = self._offered.held
+        hearers = Counter(hearer.name for hearer in self._hearers)
+        taken = Counter(name for name, topic in self._topics.items() for _ in topic.subscriptions)
+        return held.differences(Held(hearers + offered.publishers, taken + offered.subscriptions))
 
     @property
     def encoding(self) -> None:
@@ -214,7 +236,7 @@ class TwinEndpoint:
 
     @property
     def drops(self) -> Mapping[DropReason, int]:
-        return self._drops
+        return self._drops + self._offered.drops
 
     def register_metrics(self, metrics: Metrics) -> None:
         register_twins(metrics, self.robots, self._now)

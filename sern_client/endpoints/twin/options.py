@@ -5,6 +5,15 @@ from typing import Literal
 
 
 @dataclass(frozen=True, slots=True)
+class FrameOrigin:
+    """Where the origin of a robot's frame is in that of the site, and which way its x axis looks."""
+
+    x_m: float = 0.0
+    y_m: float = 0.0
+    yaw_rad: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class RobotOptions:
     name: str
     pose: str
@@ -12,6 +21,7 @@ class RobotOptions:
     max_speed_mps: float = 2.0
     max_yaw_rate_radps: float = 6.0
     gap_s: float = 0.5
+    origin: FrameOrigin = FrameOrigin()
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,18 +36,31 @@ class Air:
         self.sizes: list[int] = []
         self.lost: Callable[[str], bool] = lambda _object_id: False
 
-    def put(self, client: str, object_id: str, kind: ObjectKind, type_name: str, value: bytes) -> None:
+    def put(
+        self, client: str, object_id: str, kind: ObjectKind, type_name: str, value: bytes, attributes: dict[str, str]
+    ) -> None:
         self.sizes.append(len(value))
         for name, node in self.nodes.items():
             if name != client and not self.lost(object_id):
-                node.changed(told(object_id, client, value, kind))
+                node.changed(told(object_id, client, value, kind, attributes))
+
+    def delete(self, client: str, object_id: str) -> None:
+        for name, node in self.nodes.items():
+            if name != client:
+                node.deleted(object_id)
 
 
-def told(object_id: str, owner: str, value: bytes | None, kind: ObjectKind = ObjectKind.PATCH) -> XrObject:
+def told(
+    object_id: str,
+    owner: str,
+    value: bytes | None,
+    kind: ObjectKind = ObjectKind.PATCH,
+    attributes: dict[str, str] | None = None,
+) -> XrObject:
     return XrObject(
         id=object_id, owner=ClientName(owner), kind=kind, type_name="sern/ScenePatch", definition="",
-        definition_hash="", attributes={}, value=value, value_bytes=len(value or b""), value_sha256=None, seq=1,
-        ros_stamp_ns=None, wall_ns=0, created_s=0.0, updated_s=0.0, version=1,
+        definition_hash="", attributes=attributes or {}, value=value, value_bytes=len(value or b""), value_sha256=None,
+        seq=1, ros_stamp_ns=None, wall_ns=0, created_s=0.0, updated_s=0.0, version=1,
     )  # fmt: skip
 
 
@@ -76,11 +89,21 @@ class Site:
         air.nodes[name] = self.node
 
     # SiteObjects
-    def put(self, object_id: str, kind: ObjectKind, type_name: str, *, value: bytes = b"", **_more: Any) -> None:
-        self.air.put(self.name, object_id, kind, type_name, value)
+    def put(
+        self,
+        object_id: str,
+        kind: ObjectKind,
+        type_name: str,
+        *,
+        value: bytes = b"",
+        attributes: dict[str, str] | None = None,
+        ros_stamp_ns: int | None = None,
+    ) -> None:
+        self.air.put(self.name, object_id, kind, type_name, value, attributes or {})
 
     def delete(self, object_id: str) -> bool:
-        raise AssertionError(object_id)
+        self.air.delete(self.name, object_id)
+        return True
 
     def listen(self, listener: object) -> None: ...
 
@@ -132,7 +155,7 @@ class Site:
     def turn(self) -> None:
         """One turn of the daemon's loop."""
         placed = self.node.take()
-        self.node.fuse(placed)
+        self.node.fuse(placed, self.node.twin_cells())
         self.node.tick(seen=bool(placed))
 
     def seen(self) -> Cells:
@@ -267,7 +290,7 @@ def test_patches_in_anothers_name_or_for_another_grid_change_nothing(caplog: pyt
     other = Site(Air(), "other", grid=Grid(-5.0, -5.0, 0.2, 50, 50, frame_id="odom"))
     taken: list[bytes] = []
     for source in (robot, mallory, other):
-        source.air.put = lambda _client, _id, _kind, _type, value: taken.append(value)  # type: ignore[method-assign, assignment]
+        source.air.put = lambda _client, _id, _kind, _type, value, _attributes: taken.append(value)  # type: ignore[method-assign, assignment]
         source.marker()
         source.turn()
     caplog.clear()

@@ -1,5 +1,6 @@
 """What is to be seen of all robots at one moment: as last heard, as shown, where they go, and how sure that is."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
@@ -7,6 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sern_client.endpoints.twin.options import FrameOrigin
 from sern_client.endpoints.twin.robot import RobotTwin
 from sern_twin.motion import Motion
 from sern_twin.synchroniser import Twin
@@ -23,7 +25,7 @@ _SNAPSHOT_BYTES: Final = 256
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """The place of a base in the robot's frame: east, north, height, and its heading from east to north."""
+    """The place of a base in the frame of the site: east, north, height, and its heading from east to north."""
 
     x_m: float
     y_m: float
@@ -95,14 +97,14 @@ def robot_frame(robot: RobotTwin, twin: Twin | None, path: Sequence[Motion], say
     z_m = frame.z_m if abs(frame.z_m) <= MOST_HEIGHT_M else 0.0
     if twin is None:
         return RobotFrame(name, frame_id, None, None, NO_PATH, 0.0, 0.0, level, says)
-    shown, heard = twin.shown, robot.last_heard
-    path_m = np.array([(step.x_m - shown.x_m, step.y_m - shown.y_m) for step in path], np.float32).reshape(-1, 2)
+    shown, heard, origin = twin.shown, robot.last_heard, robot.options.origin
+    path_m = np.array([(step.x_m - shown.x_m, step.y_m - shown.y_m) for step in path], np.float64).reshape(-1, 2)
     return RobotFrame(
         name,
         frame_id,
-        None if heard is None else _place(heard, z_m),
-        _place(shown, z_m),
-        path_m,
+        None if heard is None else _place(heard, z_m, origin),
+        _place(shown, z_m, origin),
+        (path_m @ _turn(origin.yaw_rad)).astype(np.float32),
         twin.error_m,
         twin.age_s,
         level,
@@ -110,8 +112,15 @@ def robot_frame(robot: RobotTwin, twin: Twin | None, path: Sequence[Motion], say
     )
 
 
-def _place(motion: Motion, z_m: float) -> Place:
-    return Place(motion.x_m, motion.y_m, z_m, motion.yaw_rad)
+def _place(motion: Motion, z_m: float, origin: FrameOrigin) -> Place:
+    x_m, y_m = (motion.x_m, motion.y_m) @ _turn(origin.yaw_rad)
+    return Place(origin.x_m + float(x_m), origin.y_m + float(y_m), z_m, origin.yaw_rad + motion.yaw_rad)
+
+
+def _turn(yaw_rad: float) -> NDArray[np.float64]:
+    """Rows of places times it are in axes from which those of the places are turned so."""
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    return np.array([(cos, sin), (-sin, cos)])
 
 
 def places(snapshot: Snapshot) -> Mapping[str, Place]:

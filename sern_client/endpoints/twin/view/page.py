@@ -10,16 +10,20 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
 from viser import ViserServer
 
 from sern_client.endpoints.twin.options import ViewOptions
 from sern_client.endpoints.twin.view.frames import Box, RobotFrame, Snapshot, places
 from sern_client.endpoints.twin.view.history import LENGTH_S
-from sern_client.endpoints.twin.view.scene import LEVEL_COLOURS, ROBOT_COLOURS, Colour, Drawing
+from sern_client.endpoints.twin.view.scene import DISCREPANCY_COLOURS, LEVEL_COLOURS, ROBOT_COLOURS, Colour, Drawing
 from sern_core.vocabulary.errors import ConfigError
+from sern_twin.world.discrepancy import SeenDiscrepancy
+from sern_twin.world.mesh import Mesh
+from sern_twin.world.terrain import Terrain
 
 NOBODY: Final = "nobody"
+MOST_LINES: Final = 10
+"""Discrepancies in words."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +33,7 @@ class Picture:
     snapshot: Snapshot
     ago_s: float
     reaches_s: float
+    discrepancies: tuple[SeenDiscrepancy, ...] = ()
 
 
 class Page:
@@ -79,8 +84,9 @@ class Page:
                 return
             with self._server.atomic():
                 self.drawing.draw(picture.snapshot)
+                self.drawing.discrepancies(picture.discrepancies)
             self._say("link", link_html(picture))
-            self._say("table", table_html(picture.snapshot))
+            self._say("table", table_html(picture.snapshot, picture.discrepancies))
             self._look(picture.snapshot)
 
     def blocks(self, boxes: list[Box]) -> None:
@@ -88,10 +94,10 @@ class Page:
             if not self._closed:
                 self.drawing.blocks(boxes)
 
-    def terrain(self, vertices: ArrayLike, faces: ArrayLike) -> None:
+    def ground(self, mesh: Mesh, terrain: Terrain | None) -> None:
         with self._lock:
-            if not self._closed and len(np.asarray(faces)):
-                self.drawing.terrain(vertices, faces)
+            if not self._closed and len(mesh.faces):
+                self.drawing.ground(mesh, terrain)
 
     def close(self) -> None:
         with self._lock, contextlib.redirect_stdout(io.StringIO()):
@@ -135,9 +141,14 @@ def link_html(picture: Picture) -> str:
     return f'<div style="padding:0 1em 0.8em">{when} ({kept})<br>link: {link}</div>'
 
 
-def table_html(snapshot: Snapshot) -> str:
-    """The promise of each robot: how old, how far off at most."""
+def table_html(snapshot: Snapshot, discrepancies: tuple[SeenDiscrepancy, ...] = ()) -> str:
+    """The promise of each robot: how old, how far off at most; and where the twin of the site is wrong."""
     lines = "".join(_line(number, robot) for number, robot in enumerate(snapshot.robots))
+    for thing in discrepancies[:MOST_LINES]:
+        where = f"({thing.east_m:.1f}, {thing.north_m:.1f}) m"
+        lines += f"<p>{_coloured('▲', DISCREPANCY_COLOURS[thing.kind])} {html.escape(thing.says)} {where}</p>"
+    if len(discrepancies) > MOST_LINES:
+        lines += f"<p>and {len(discrepancies) - MOST_LINES} more</p>"
     return f'<div style="padding:0 1em;max-height:24em;overflow:auto">{lines}</div>'
 
 

@@ -9,9 +9,12 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from sern_client.endpoints.twin.view.frames import ERROR, OK, STALE, WARN, Box, Place, RobotFrame, Snapshot
+from sern_twin.world.discrepancy import DiscrepancyKind, SeenDiscrepancy
+from sern_twin.world.mesh import Mesh
+from sern_twin.world.terrain import Terrain
 
 if TYPE_CHECKING:
     from viser import FrameHandle, SceneApi
@@ -25,6 +28,12 @@ ROBOT_COLOURS: Final[tuple[Colour, ...]] = (
 LEVEL_COLOURS: Final[dict[int, Colour]] = {
     OK: (22, 163, 74), WARN: (245, 158, 11), ERROR: (220, 38, 38), STALE: (148, 163, 184)
 }  # fmt: skip
+DISCREPANCY_COLOURS: Final[dict[DiscrepancyKind, Colour]] = {
+    DiscrepancyKind.PHANTOM: (147, 51, 234), DiscrepancyKind.UNKNOWN_OBSTACLE: (220, 38, 38)
+}  # fmt: skip
+DISCREPANCY_M: Final = 1.2
+"""How high they are drawn."""
+MOST_LABELS: Final = 12
 HEARD_COLOUR: Final[Colour] = (120, 128, 140)
 YOUNG: Final[Colour] = (13, 148, 136)
 OLD: Final[Colour] = (203, 193, 178)
@@ -59,12 +68,14 @@ class Camera(NamedTuple):
 
 
 class Drawing:
-    """`draw`, `blocks` and `terrain` in any order, by one thread at a time."""
+    """`ground` first, where there is one; all else in any order, by one thread at a time."""
 
     def __init__(self, scene: "SceneApi") -> None:
         self._scene = scene
         self._origin: NDArray[np.float64] | None = None
         self._robots: list[_RobotMarks] = []
+        self._terrain: Terrain | None = None
+        self._discrepancies: tuple[SeenDiscrepancy, ...] = ()
         scene.configure_environment_map(None)
         scene.add_light_hemisphere("/light/sky", sky_color=(255, 255, 255), ground_color=(190, 190, 190), intensity=1.4)
         scene.add_grid(
@@ -80,8 +91,10 @@ class Drawing:
             if robot.shown is None:
                 self._robots[number].hide()
             else:
+                path_m = robot.path_m + np.array((robot.shown.x_m, robot.shown.y_m))
+                up_m = self._up_m(path_m, robot.shown.z_m) - self._up_m(path_m[:1], robot.shown.z_m).sum()
                 self._robots[number].show(
-                    robot, self.local(robot.shown), None if robot.heard is None else self.local(robot.heard)
+                    robot, self.local(robot.shown), None if robot.heard is None else self.local(robot.heard), up_m
                 )
 
     def blocks(self, boxes: Sequence[Box]) -> None:
@@ -91,7 +104,8 @@ class Drawing:
             return
         x_m, y_m, size_m, height_m, ages_s = (np.array(column, np.float64) for column in zip(*boxes, strict=True))
         origin = self._need_origin(Place(float(x_m[0]), float(y_m[0]), 0.0, 0.0))
-        positions = np.column_stack([x_m - origin[0], y_m - origin[1], np.zeros(len(boxes))])
+        up_m = self._up_m(np.column_stack([x_m, y_m]), origin[2])
+        positions = np.column_stack([x_m, y_m, up_m]) - origin
         self._scene.add_batched_meshes_simple(
             "/blocks",
             _CUBE_VERTICES,
@@ -105,26 +119,75 @@ class Drawing:
             cast_shadow=False,
         )
 
-    def terrain(self, vertices: ArrayLike, faces: ArrayLike) -> None:
-        """Show the ground: corners (n, 3) of east, north, height in metres, and triangles (m, 3) of their numbers."""
-        corners = np.asarray(vertices, np.float64)
-        origin = self._need_origin(Place(float(corners[0, 0]), float(corners[0, 1]), float(corners[0, 2]), 0.0))
+    def ground(self, mesh: Mesh, terrain: Terrain | None) -> None:
+        """Show the ground, and what stands on it. Where its heights are known, all else is drawn on it."""
+        corners = mesh.vertices.astype(np.float64)
+        self._terrain = terrain
+        east_m, north_m, up_m = (float(value) for value in corners[0])
+        if terrain is not None:
+            up_m = float(np.nanmedian(terrain.heights_m))
+            self._scene.remove_by_name("/ground")
+        origin = self._need_origin(Place(east_m, north_m, up_m, 0.0), known=terrain is not None)
         self._scene.add_mesh_simple(
-            "/terrain", (corners - origin).astype(np.float32), np.asarray(faces, np.uint32), color=(214, 208, 192),
+            "/terrain", (corners - origin).astype(np.float32), mesh.faces.astype(np.uint32), color=(214, 208, 192),
             flat_shading=True, side="double", cast_shadow=False,
         )  # fmt: skip
 
+    def discrepancies(self, found: tuple[SeenDiscrepancy, ...]) -> None:
+        """Show where the twin is wrong, in place of what did before."""
+        if found == self._discrepancies:
+            return
+        for number in range(min(len(self._discrepancies), MOST_LABELS)):
+            self._scene.remove_by_name(f"/discrepancies/{number}")
+        self._discrepancies = found
+        if not found:
+            self._scene.remove_by_name("/discrepancies/all")
+            return
+        places = np.array([(thing.east_m, thing.north_m) for thing in found])
+        origin = self._need_origin(Place(float(places[0, 0]), float(places[0, 1]), 0.0, 0.0))
+        positions = np.column_stack([places, self._up_m(places, origin[2])]) - origin
+        radii_m = np.array([thing.radius_m for thing in found])
+        self._scene.add_batched_meshes_simple(
+            "/discrepancies/all",
+            *_cylinder(),
+            batched_wxyzs=np.tile(np.array([1.0, 0.0, 0.0, 0.0], np.float32), (len(found), 1)),
+            batched_positions=positions.astype(np.float32),
+            batched_scales=np.column_stack([radii_m, radii_m, np.full(len(found), DISCREPANCY_M)]).astype(np.float32),
+            batched_colors=np.array([DISCREPANCY_COLOURS[thing.kind] for thing in found], np.uint8),
+            opacity=0.4,
+            side="double",
+            lod="off",
+            cast_shadow=False,
+        )
+        for number, thing in enumerate(found[:MOST_LABELS]):
+            x_m, y_m, z_m = (float(value) for value in positions[number])
+            self._scene.add_label(
+                f"/discrepancies/{number}", thing.says, position=(x_m, y_m, z_m + DISCREPANCY_M + 0.2),
+                anchor="bottom-center", font_screen_scale=0.9,
+            )  # fmt: skip
+
     def local(self, place: Place) -> Place:
-        """A place of the site as one of the scene."""
+        """A place of the site as one of the scene: on its ground, where that is known."""
         origin = self._need_origin(place)
-        return Place(place.x_m - origin[0], place.y_m - origin[1], place.z_m - origin[2], place.yaw_rad)
+        z_m = float(self._up_m(np.array([(place.x_m, place.y_m)]), place.z_m)[0])
+        return Place(place.x_m - origin[0], place.y_m - origin[1], z_m - origin[2], place.yaw_rad)
+
+    def _up_m(self, places_m: NDArray[np.float64], otherwise_m: float) -> NDArray[np.float64]:
+        """The height of the ground at places (n, 2); where nobody knows, this one."""
+        if self._terrain is None:
+            return np.full(len(places_m), otherwise_m)
+        heights_m = self._terrain.height_m(places_m[:, 0], places_m[:, 1])
+        missing_m = float(np.nanmedian(self._terrain.heights_m))
+        return np.where(np.isnan(heights_m), missing_m, heights_m)
 
     def camera(self, snapshot: Snapshot) -> Camera | None:
         """Where all robots and their paths are seen well. None: there are none yet."""
         found: list[tuple[float, float]] = []
+        z_m = 0.0
         for robot in snapshot.robots:
             if robot.shown is not None:
                 shown = self.local(robot.shown)
+                z_m = shown.z_m
                 found += [(shown.x_m + x_m, shown.y_m + y_m) for x_m, y_m in ((0.0, 0.0), *robot.path_m.tolist())]
                 if robot.heard is not None:
                     heard = self.local(robot.heard)
@@ -137,13 +200,14 @@ class Drawing:
         x_m, y_m = (float(value) for value in middle)
         x_m, y_m = x_m + 0.3 * reach_m, y_m - 0.15 * reach_m  # what stands beside the scene hides its right
         away_m = 1.4 * reach_m
-        return Camera((x_m - 0.2 * away_m, y_m - 0.85 * away_m, 0.75 * away_m), (x_m, y_m, 0.0))
+        return Camera((x_m - 0.2 * away_m, y_m - 0.85 * away_m, z_m + 0.75 * away_m), (x_m, y_m, z_m))
 
-    def _need_origin(self, near: Place) -> NDArray[np.float64]:
+    def _need_origin(self, near: Place, *, known: bool = False) -> NDArray[np.float64]:
+        """`known`: its height is that of the ground."""
         if self._origin is None:
             self._origin = np.array(
                 [round(near.x_m / ORIGIN_STEP_M) * ORIGIN_STEP_M, round(near.y_m / ORIGIN_STEP_M) * ORIGIN_STEP_M,
-                 near.z_m if abs(near.z_m) > ORIGIN_STEP_M else 0.0]
+                 near.z_m if known or abs(near.z_m) > ORIGIN_STEP_M else 0.0]
             )  # fmt: skip
         return self._origin
 
@@ -198,8 +262,8 @@ class _RobotMarks:
         for handle in self._all:
             handle.visible = False
 
-    def show(self, robot: RobotFrame, shown: Place, heard: Place | None) -> None:
-        """`shown`, `heard`: in the scene."""
+    def show(self, robot: RobotFrame, shown: Place, heard: Place | None, path_up_m: NDArray[np.float64]) -> None:
+        """`shown`, `heard`: in the scene. `path_up_m`: how much higher each place of the path is than the first."""
         _move(self._twin, shown)
         self._label.text = robot.label
         self._heard.visible = heard is not None
@@ -222,7 +286,7 @@ class _RobotMarks:
             handle.visible = True
         self._path.visible = len(robot.path_m) > 1
         if self._path.visible:
-            self._path.points = _segments(robot.path_m)
+            self._path.points = _segments(np.column_stack([robot.path_m, path_up_m]).astype(np.float32))
             self._path.colors = np.broadcast_to(self._path_colour, (len(robot.path_m) - 1, 2, 3)).copy()
             self._path.position = (shown.x_m, shown.y_m, shown.z_m + _PATH_Z_M)
 
@@ -251,7 +315,21 @@ def _line(start: Place, end: Place) -> NDArray[np.float32]:
 
 
 def _segments(path_m: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(n - 1, 2, 3) of points (n, 2)."""
-    points = np.column_stack([path_m, np.zeros(len(path_m), np.float32)])
-    found: NDArray[np.float32] = np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)
+    """(n - 1, 2, 3) of points (n, 3)."""
+    found: NDArray[np.float32] = np.stack([path_m[:-1], path_m[1:]], axis=1)
     return found
+
+
+def _cylinder() -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    """The side of one, of radius and height 1."""
+    low = _circle()
+    high = low + np.array((0.0, 0.0, 1.0), np.float32)
+    corner = np.arange(CIRCLE_CORNERS, dtype=np.uint32)
+    after = np.roll(corner, -1)
+    faces = np.concatenate(
+        [
+            np.column_stack([corner, after, after + CIRCLE_CORNERS]),
+            np.column_stack([corner, after + CIRCLE_CORNERS, corner + CIRCLE_CORNERS]),
+        ]
+    )
+    return np.concatenate([low, high]), faces.astype(np.uint32)

@@ -13,7 +13,7 @@ from sern_client.endpoints.base import SceneShown
 from sern_client.endpoints.common.saying import SayOnce
 from sern_client.endpoints.twin.options import ViewOptions
 from sern_client.endpoints.twin.view.frames import Snapshot
-from sern_client.endpoints.twin.view.history import STEP_S, History
+from sern_client.endpoints.twin.view.history import STEP_S, History, SceneHistory, SceneMoment
 from sern_runtime.entry import end_tasks
 
 if TYPE_CHECKING:
@@ -48,6 +48,7 @@ class TwinView:
         self._look = look
         self._now = now
         self.history = History()
+        self.scene_history = SceneHistory()
         self.failures = 0
         self.page: Page | None = None
         self.scene: SceneShown | None = None
@@ -57,6 +58,8 @@ class TwinView:
         self._blocks_due_s = 0.0
         self._ages_due_s = 0.0
         self._changes = -1
+        self._past: SceneMoment | None = None
+        """What is drawn of the scene, if not that of now."""
 
     async def start(self) -> None:
         """ConfigError: the address cannot be listened on."""
@@ -89,14 +92,24 @@ class TwinView:
 
     async def _record(self) -> None:
         begin_s = self._now()
+        await self.record()
+        await asyncio.sleep(pause_s(STEP_S, self._now() - begin_s))
+
+    async def record(self) -> None:
+        """Keep what is to be seen now, where it is time for that."""
+        begin_s = self._now()
         if self.history.due(begin_s):
             self.history.add(self._look())
-        await asyncio.sleep(pause_s(STEP_S, self._now() - begin_s))
+        scene = self.scene
+        if scene is not None and self.scene_history.due(begin_s, scene.changes):
+            changes = scene.changes
+            parts = begin_s, scene.cells(), scene.ages_s(), scene.discrepancies()
+            self.scene_history.add(await asyncio.to_thread(SceneMoment.of, *parts), changes)
 
     async def _show(self) -> None:
         begin_s, page = self._now(), self.page
         if page is None or not page.watched:
-            self._changes = -1  # for who comes next all of it is drawn at once
+            self._changes, self._past = -1, None  # for who comes next all of it is drawn at once
         else:
             await self.draw(page)
         await asyncio.sleep(pause_s(DRAW_S, self._now() - begin_s))
@@ -109,22 +122,35 @@ class TwinView:
         latest = self._look()
         self.history.add(latest)
         snapshot = latest if ago_s <= 0 else self.history.at(now - ago_s) or latest
-        picture = Picture(snapshot, now - snapshot.time_s if ago_s > 0 else 0.0, self.history.reaches_s(now))
-        await asyncio.to_thread(page.draw, picture)
-        await self._draw_blocks(page, now)
-
-    async def _draw_blocks(self, page: "Page", now: float) -> None:
+        past = None if ago_s <= 0 else self.scene_history.at(now - ago_s)
         scene = self.scene
-        if scene is None or now < self._blocks_due_s or (scene.changes == self._changes and now < self._ages_due_s):
+        if scene is not None and scene.ground is not None and not self._grounded:
+            self._grounded = True
+            await asyncio.to_thread(page.ground, scene.ground, scene.terrain)
+        discrepancies = () if scene is None else scene.discrepancies() if past is None else past.discrepancies
+        picture = Picture(
+            snapshot, now - snapshot.time_s if ago_s > 0 else 0.0, self.history.reaches_s(now), discrepancies
+        )
+        await asyncio.to_thread(page.draw, picture)
+        if scene is not None:
+            await self._draw_blocks(page, scene, past, now)
+
+    async def _draw_blocks(self, page: "Page", scene: SceneShown, past: SceneMoment | None, now: float) -> None:
+        """As they are, or as they were in the past; seldom, since there may be many."""
+        other = past is not self._past
+        changed = past is None and (scene.changes != self._changes or now >= self._ages_due_s)
+        if not other and not (changed and now >= self._blocks_due_s):
             return
-        if not self._grounded and scene.ground is not None:
-            await asyncio.to_thread(page.terrain, scene.ground.vertices, scene.ground.faces)
-        self._grounded = True
         from sern_client.endpoints.twin.view.blocks import boxes  # needs what a scene does
 
+        self._past = past
         self._changes, self._blocks_due_s, self._ages_due_s = scene.changes, now + BLOCKS_S, now + AGES_S
-        grid, cells, ages_s = scene.grid, scene.cells(), scene.ages_s()
-        await asyncio.to_thread(lambda: page.blocks(boxes(grid, cells, ages_s)))
+        grid = scene.grid
+        if past is None:
+            cells, ages_s = scene.cells(), scene.ages_s()
+            await asyncio.to_thread(lambda: page.blocks(boxes(grid, cells, ages_s)))
+        else:
+            await asyncio.to_thread(lambda: page.blocks(boxes(grid, past.cells, past.ages_s)))
 
 
 def pause_s(least_s: float, took_s: float) -> float:

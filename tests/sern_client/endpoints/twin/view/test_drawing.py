@@ -10,7 +10,20 @@ import pytest
 
 from benchmarks.twin_picture import World, bend
 from sern_client.endpoints.twin.view.frames import Box, Snapshot
-from sern_client.endpoints.twin.view.scene import LEVEL_COLOURS, OLD, OLD_S, UNDATED, YOUNG, Drawing, age_colours
+from sern_client.endpoints.twin.view.scene import (
+    DISCREPANCY_COLOURS,
+    LEVEL_COLOURS,
+    OLD,
+    OLD_S,
+    UNDATED,
+    YOUNG,
+    Drawing,
+    age_colours,
+)
+from sern_twin.world.discrepancy import DiscrepancyKind, SeenDiscrepancy
+from sern_twin.world.grid import Grid
+from sern_twin.world.mesh import Mesh
+from sern_twin.world.terrain import Terrain
 
 
 class FakeScene:
@@ -81,8 +94,48 @@ def test_a_site_far_from_its_zero_is_drawn_near_that_of_the_scene() -> None:
     assert found["/robots/0/twin"].position[0] == 0.25
     draws.blocks([Box(4e6 + 1.5, 2.0, 0.5, 0.5, 1.0)])
     assert found["/blocks"].batched_positions.tolist() == [[1.5, 2.0, 0.0]]
-    draws.terrain([(4e6, 0.0, 0.0), (4e6 + 10, 0.0, 1.0), (4e6, 10.0, 2.0)], [(0, 1, 2)])
-    assert "/terrain" in found
+    corners = np.array([(4e6, 0.0, 0.0), (4e6 + 10, 0.0, 1.0), (4e6, 10.0, 2.0)], np.float32)
+    draws.ground(Mesh(corners, np.array([(0, 1, 2)], np.int32)), None)
+    assert "/terrain" in found and "/ground" in found
+
+
+def test_robots_paths_and_what_stands_around_are_on_the_ground() -> None:
+    """A hill of one in ten that is 300 m high at its foot; odometry says that the robot is at height 0."""
+    grid = Grid(-50.0, -50.0, 0.5, 200, 200)
+    hill = Terrain(grid, 300.0 + 0.1 * grid.all_centres()[..., 0].reshape(grid.shape))
+    draws, found = drawing()
+    draws.ground(hill.mesh(10), hill)
+    assert "/ground" not in found, "the plane would cut it"
+    snapshot = silent()
+    draws.draw(snapshot)
+    robot = snapshot.robots[0]
+    assert robot.shown is not None
+    twin, path = found["/robots/0/twin"], found["/robots/0/path"]
+    assert twin.position[2] == pytest.approx(0.1 * robot.shown.x_m, abs=0.01), "the scene is as high as its middle"
+    rises_m = path.points[:, 1, 2] - path.points[0, 0, 2]
+    assert rises_m == pytest.approx(0.1 * robot.path_m[1:, 0], abs=0.01)
+    draws.blocks([Box(20.0, 2.0, 0.5, 0.5, 1.0)])
+    assert found["/blocks"].batched_positions[0].tolist() == pytest.approx([20.0, 2.0, 2.0], abs=0.01)
+    camera = draws.camera(snapshot)
+    assert camera is not None and abs(camera.look_at[2]) < 5.0
+    draws.blocks([Box(2000.0, 2.0, 0.5, 0.5, 1.0)])
+    assert found["/blocks"].batched_positions[0, 2] == pytest.approx(0.0, abs=0.1), "beyond what is known"
+
+
+def test_where_the_twin_is_wrong_is_drawn_and_goes() -> None:
+    draws, found = drawing()
+    phantom = SeenDiscrepancy("a", "jackal1", DiscrepancyKind.PHANTOM, 1.0, 2.0, 0.5, 9)
+    obstacle = SeenDiscrepancy("b", "jackal1", DiscrepancyKind.UNKNOWN_OBSTACLE, 4.0, 2.0, 1.5, 99)
+    draws.discrepancies((phantom, obstacle))
+    drawn = found["/discrepancies/all"]
+    assert drawn.batched_positions[:, :2].tolist() == [[1.0, 2.0], [4.0, 2.0]]
+    assert drawn.batched_scales[:, 0].tolist() == [0.5, 1.5]
+    assert drawn.batched_colors.tolist() == [list(DISCREPANCY_COLOURS[each.kind]) for each in (phantom, obstacle)]
+    assert {"/discrepancies/0", "/discrepancies/1"} <= found.keys()
+    draws.discrepancies((obstacle,))
+    assert found["/discrepancies/all"].batched_scales[:, 0].tolist() == [1.5] and "/discrepancies/1" not in found
+    draws.discrepancies(())
+    assert not [name for name in found if name.startswith("/discrepancies")]
 
 
 def test_blocks_have_the_colours_of_their_ages_and_go() -> None:

@@ -5,6 +5,7 @@ import math
 import pytest
 
 from benchmarks.twin_picture import LINK, World, bend, straight
+from sern_client.endpoints.twin.options import FrameOrigin
 from sern_client.endpoints.twin.view.frames import MOST_FRAME_CHARS, OK, STALE, WARN, places
 
 
@@ -48,6 +49,21 @@ def test_a_path_far_from_the_zero_of_its_frame_is_as_fine_as_elsewhere() -> None
     robot = world.endpoint.snapshot().robots[1]
     steps_m = robot.path_m[1:, 0] - robot.path_m[:-1, 0]
     assert steps_m.tolist() == pytest.approx([0.125] * 20, abs=0.002)
+
+
+def test_a_robot_is_in_the_frame_of_the_site_where_its_own_begins_elsewhere() -> None:
+    """It was switched on 10 m to the east, looking north: its odometry knows nothing of that."""
+    world = World(origin=FrameOrigin(10.0, 0.0, math.pi / 2))
+    world.play(4.0, 1.0)
+    robot = world.endpoint.snapshot().robots[1]
+    assert robot.shown is not None and robot.heard is not None
+    there = straight(5.0)
+    assert (robot.shown.x_m, robot.shown.y_m) == pytest.approx((10.0 - there.y_m, there.x_m), abs=0.02)
+    assert (robot.heard.x_m, robot.heard.y_m) == pytest.approx((10.0 - there.y_m, there.x_m), abs=0.02)
+    assert math.remainder(robot.shown.yaw_rad - there.yaw_rad - math.pi / 2, math.tau) == pytest.approx(0, abs=0.01)
+    ahead = straight(10.0)
+    end_x_m, end_y_m = (float(value) for value in robot.path_m[-1])
+    assert (end_x_m, end_y_m) == pytest.approx((there.y_m - ahead.y_m, ahead.x_m - there.x_m), abs=0.1)
 
 
 @pytest.mark.parametrize("z_m", [math.nan, math.inf, -math.inf, 1e300])

@@ -18,6 +18,7 @@ from sern_client.endpoints.twin.view.frames import Snapshot
 from sern_client.endpoints.twin.view.server import TwinView
 from sern_core.vocabulary.errors import ConfigError
 from sern_tools.harness.browser import Tab, browser, opened
+from sern_twin.world.discrepancy import DiscrepancyKind, SeenDiscrepancy
 from tests.support import Events, Patience, until
 
 viser = pytest.importorskip("viser", reason="needs viser: pip install 'sern[viz]'")
@@ -97,6 +98,9 @@ def test_what_others_chose_the_words_of_is_text() -> None:
     assert "12 s ago" in link_html(Picture(snapshot, 12.0, 30.0))
     said = table_html(snapshot)
     assert "jackal1" in said and "0.00 s old, error at most 0.02 m" in said
+    wrong = SeenDiscrepancy("a", "<b>robot", DiscrepancyKind.PHANTOM, 1.26, 2.0, 0.5, 9)
+    said = table_html(snapshot, (wrong,) * 12)
+    assert said.count("phantom: &lt;b&gt;robot sees nothing there (1.3, 2.0) m") == 10 and "and 2 more" in said
 
 
 def where(red: int, green: int, blue: int) -> Callable[[Pixels], NDArray[np.int64]]:

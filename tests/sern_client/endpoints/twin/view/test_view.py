@@ -8,9 +8,10 @@ from benchmarks.twin_picture import World, yard
 from sern_client.endpoints.twin.options import ViewOptions
 from sern_client.endpoints.twin.view.frames import Box
 from sern_client.endpoints.twin.view.server import AGES_S, BLOCKS_S, DRAW_S, SHARE, TwinView, pause_s
+from sern_twin.world.discrepancy import DiscrepancyKind, SeenDiscrepancy
 from sern_twin.world.mesh import Mesh
 from sern_twin.world.patches import Cells
-from sern_twin.world.terrain import flat
+from sern_twin.world.terrain import Terrain, flat
 
 
 class FakePage:
@@ -22,9 +23,9 @@ class FakePage:
         self.boxes: list[list[Box]] = []
         self.grounds: list[int] = []
 
-    def terrain(self, vertices: Any, faces: Any) -> None:
-        assert np.asarray(faces).max() < len(vertices)
-        self.grounds.append(len(faces))
+    def ground(self, mesh: Mesh, terrain: Terrain | None) -> None:
+        assert mesh.faces.max() < len(mesh.vertices) and terrain is not None
+        self.grounds.append(len(mesh.faces))
 
     def draw(self, picture: object) -> None:
         self.drawn.append(picture)
@@ -40,7 +41,13 @@ class FakeScene:
         self.grid, self._cells, self._ages_s = yard()
         self.changes = 0
         self.asked = 0
+        self.terrain: Terrain | None = flat(self.grid)
         self.ground: Mesh | None = flat(self.grid).mesh(step=10)
+        self.found: tuple[SeenDiscrepancy, ...] = ()
+
+    def set_one_box(self) -> None:
+        self._cells = np.where(np.arange(self._cells.size).reshape(self._cells.shape) == 77, 100, -1).astype(np.int8)
+        self.changes += 1
 
     def cells(self) -> Cells:
         self.asked += 1
@@ -48,6 +55,9 @@ class FakeScene:
 
     def ages_s(self) -> Any:
         return self._ages_s
+
+    def discrepancies(self) -> tuple[SeenDiscrepancy, ...]:
+        return self.found
 
 
 def made(world: World) -> tuple[TwinView, FakePage, Any]:
@@ -79,7 +89,8 @@ async def test_what_stands_around_is_drawn_when_it_changes_and_as_it_gets_older(
     view, page, as_page = made(world)
     await view.draw(as_page)
     assert page.boxes == [], "there is no scene"
-    scene = view.scene = FakeScene()
+    scene = FakeScene()
+    view.scene = scene
     world.now = 100.0
     await view.draw(as_page)
     assert len(page.boxes) == 1 and len(page.boxes[0]) > 100
@@ -101,6 +112,31 @@ async def test_what_stands_around_is_drawn_when_it_changes_and_as_it_gets_older(
     assert scene.asked == 4, "older by now"
 
 
+async def test_the_slider_moves_what_stands_around_too() -> None:
+    world = World()
+    view, page, as_page = made(world)
+    scene = FakeScene()
+    view.scene = scene
+    phantom = SeenDiscrepancy("a", "robot", DiscrepancyKind.PHANTOM, 1.0, 2.0, 0.5, 9)
+    for step in range(60):
+        world.now = float(step)
+        if step == 30:
+            scene.set_one_box()
+            scene.found = (phantom,)
+        await view.record()
+    assert len(view.scene_history) == 2, "it changed once"
+    await view.draw(as_page)
+    page.ago_s = 40.0
+    await view.draw(as_page)
+    await view.draw(as_page)
+    page.ago_s = 10.0
+    await view.draw(as_page)
+    page.ago_s = 0.0
+    await view.draw(as_page)
+    assert [len(boxes) for boxes in page.boxes] == [1, 320, 1, 1], "now, then once, at its end, and now again"
+    assert [picture.discrepancies for picture in page.drawn] == [(phantom,), (), (), (phantom,), (phantom,)]
+
+
 def test_the_view_of_many_robots_takes_a_share_of_the_time() -> None:
     assert pause_s(DRAW_S, 0.0) == pause_s(DRAW_S, 0.01) == DRAW_S
     assert 0.5 / (0.5 + pause_s(DRAW_S, 0.5)) == SHARE
@@ -115,7 +151,8 @@ async def test_the_ground_is_drawn_once() -> None:
         await view.draw(as_page)
     assert page.grounds == [len(FakeScene().ground.faces)]  # type: ignore[union-attr]
     view, page, as_page = made(world)
-    view.scene = scene = FakeScene()
+    scene = FakeScene()
     scene.ground = None
+    view.scene = scene
     await view.draw(as_page)
     assert page.grounds == [] and len(page.boxes) == 1
