@@ -81,10 +81,16 @@ def _resolved(value: str | Sequence[str] | None, resolve: Resolve) -> Path | tup
 
 def _twin(section: TwinEndpoint, resolve: Resolve) -> Endpoint:
     from sern_client.endpoints.twin.endpoint import TwinEndpoint
-    from sern_client.endpoints.twin.options import FrameOrigin, RobotOptions, TwinOptions, ViewOptions
+    from sern_client.endpoints.twin.options import Datum, FrameOrigin, RobotOptions, TwinOptions, ViewOptions
 
     robots = tuple(
-        RobotOptions(**robot.model_dump(exclude={"origin"}), origin=FrameOrigin(**robot.origin.model_dump()))
+        RobotOptions(
+            **robot.model_dump(exclude={"origin", "datum", "error_m", "error_mps"}),
+            origin=FrameOrigin(**robot.origin.model_dump()),
+            datum=None if robot.datum is None else Datum(**robot.datum.model_dump()),
+            error_m=robot.errors[0],
+            error_mps=robot.errors[1],
+        )
         for robot in section.robots
     )
     view = None

@@ -24,6 +24,7 @@ from sern_twin.predictors import MOST_STEPS, SOON_S, Limited, Predictor
 HISTORY_S: Final = 2.0
 TRIAL_S: Final = 0.5
 """How far ahead each prediction is tried while the robot is heard, to learn how wrong it gets."""
+JUMP_M: Final = 0.5
 TOO_MUCH: Final = 1.5
 """Times its limit: what is measured is noisy. More is a fault, and would lead the twin away at that speed."""
 MOST_S: Final = 1e10
@@ -70,7 +71,7 @@ class SynchroniserOptions:
     """Silence from here on is a gap, which is reported when it ends."""
     future_s: float = 0.25
     """Stamps may be so far ahead: what the two clocks are off."""
-    jump_m: float = 0.5
+    jump_m: float = JUMP_M
     """A measurement may be so much further away than the robot can have gone."""
     agreeing: int = 3
     """The robot is where so many measurements in a row say it is that were too far away and agree."""

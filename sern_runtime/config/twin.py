@@ -23,12 +23,18 @@ from sern_runtime.config.base import (
     fault,
     is_local,
 )
+from sern_runtime.config.scene import OriginSection
 from sern_runtime.config.yaml import Loc
 
 SLOW_PARTS: Final = ("path", "status")
 SCENE_PARTS: Final = (("map", PriorityClass.BULK), ("map_updates|discrepancies", PriorityClass.STATE))
 """What is published of the scene, where the file has one."""
 FAST_PARTS: Final = ("odom", "estimate", "age", "error", "unity")
+
+
+ODOMETRY_ERRORS: Final = (0.02, 0.05)
+SATELLITE_ERRORS: Final = (3.0, 0.5)
+"""How far off poses are, metres and metres a second, where the file does not say."""
 
 
 class FrameOrigin(Section):
@@ -48,7 +54,15 @@ class TwinRobot(Section):
     name: ClientText
     """What its twin is called: its topics are PREFIX/NAME/odom and so on."""
     pose: TopicText
-    """Where it says where it is (local name): nav_msgs/Odometry, best from its localisation."""
+    """Where it says where it is (local name): nav_msgs/Odometry, best from its localisation; with `datum`
+    sensor_msgs/NavSatFix."""
+    datum: OriginSection | None = None
+    """Of a robot that only satellites place: where the origin of the site is on the Earth. Its twin is in metres east
+    and north of there, in frame `map`; its heading and speed are those of the way that its fixes make."""
+    error_m: Annotated[float, Field(gt=0, le=1000)] | None = None
+    """How far off a pose may be: the bound begins there. null: 0.02 m, and 3 m of a robot with `datum`."""
+    error_mps: Annotated[float, Field(gt=0, le=100)] | None = None
+    """The same of its speed. null: 0.05 m/s, and 0.5 m/s of a robot with `datum`."""
     plan: TopicText | None = None
     """The plan that it follows (local name): nav_msgs/Path, or trajectory_msgs/MultiDOFJointTrajectory. Where the poses
     of a path have stamps that rise, they are when the robot is to be there. A twin follows a plan with times through a
@@ -62,6 +76,12 @@ class TwinRobot(Section):
     origin: FrameOrigin = FrameOrigin()
     """Where the origin of its frame is in that of the site, such as where it was switched on: its odometry begins
     there. The view shows all robots, and the scene, in that of the site; what is published stays in the robot's."""
+
+    @property
+    def errors(self) -> tuple[float, float]:
+        """How far off its poses may be: metres, metres a second."""
+        error_m, error_mps = ODOMETRY_ERRORS if self.datum is None else SATELLITE_ERRORS
+        return self.error_m or error_m, self.error_mps or error_mps
 
 
 class TwinView(Section):

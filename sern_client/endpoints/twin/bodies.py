@@ -11,10 +11,12 @@ from sern_core.vocabulary.errors import BodyError, ConfigError
 from sern_core.vocabulary.names import plain_type
 from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
+from sern_twin.fixes import Fix
 from sern_twin.geodesy import UNITY_FROM_ENU
 from sern_twin.motion import Motion, Twist
 
 ODOMETRY: Final = "nav_msgs/msg/Odometry"
+FIX: Final = "sensor_msgs/msg/NavSatFix"
 PATH: Final = "nav_msgs/msg/Path"
 TRAJECTORY: Final = "trajectory_msgs/msg/MultiDOFJointTrajectory"
 POSE: Final = "geometry_msgs/msg/PoseStamped"
@@ -55,6 +57,21 @@ def read_pose(body: bytes, encoding: Encoding) -> Pose:
     return Pose(
         stamp_of(message.header.stamp), message.header.frame_id, message.child_frame_id, motion, pose.position.z
     )
+
+
+class Said(NamedTuple):
+    """A fix of a satellite receiver. `stamp_ns`: of the robot's clock."""
+
+    stamp_ns: int
+    frame_id: str
+    fix: Fix
+
+
+def read_fix(body: bytes, encoding: Encoding) -> Said:
+    """A sensor_msgs/NavSatFix. BodyError: it is none."""
+    message = read_message(body, FIX, encoding)
+    fix = Fix(message.latitude, message.longitude, message.altitude, message.status.status >= 0)
+    return Said(stamp_of(message.header.stamp), message.header.frame_id, fix)
 
 
 def read_plan(body: bytes, type_name: str, encoding: Encoding, *, taken_ns: int) -> Planned:

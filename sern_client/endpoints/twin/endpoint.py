@@ -182,14 +182,20 @@ class TwinEndpoint:
     def advertise(self, info: TopicInfo) -> _Hearer:
         """ConfigError: it is no pose or plan of a robot, or of a type that is not read."""
         for robot in self.robots.values():
+            by_satellite = robot.options.datum is not None
             for topic, wanted, hear in (
-                (robot.options.pose, (bodies.ODOMETRY,), self._pose),
+                (
+                    robot.options.pose,
+                    *(((bodies.FIX,), self._fix) if by_satellite else ((bodies.ODOMETRY,), self._pose)),
+                ),
                 (robot.options.plan, (bodies.PATH, bodies.TRAJECTORY), self._plan),
             ):
                 if topic != info.name:
                     continue
                 if plain_type(info.type_name) not in map(plain_type, wanted) or info.encoding is Encoding.RAW:
                     reads = " or ".join(wanted)
+                    if plain_type(info.type_name) == plain_type(bodies.FIX) and topic == robot.options.pose:
+                        reads += f" (and {bodies.FIX} where the robot has `datum`, the site's origin on the Earth)"
                     raise ConfigError(
                         f"{info.name}: the twin of {robot.options.name} reads {reads}, not {info.type_name}"
                     )
@@ -210,6 +216,9 @@ class TwinEndpoint:
 
     def _pose(self, robot: RobotTwin, info: TopicInfo, body: bytes, stamp_ns: int, age_s: float) -> None:
         robot.pose(bodies.read_pose(body, info.encoding), taken_ns=stamp_ns, age_s=age_s, now=self._now())
+
+    def _fix(self, robot: RobotTwin, info: TopicInfo, body: bytes, stamp_ns: int, age_s: float) -> None:
+        robot.fix(bodies.read_fix(body, info.encoding), taken_ns=stamp_ns, age_s=age_s, now=self._now())
 
     def _plan(self, robot: RobotTwin, info: TopicInfo, body: bytes, stamp_ns: int, age_s: float) -> None:
         plan = bodies.read_plan(body, info.type_name, info.encoding, taken_ns=stamp_ns)

@@ -14,6 +14,15 @@ class FrameOrigin:
 
 
 @dataclass(frozen=True, slots=True)
+class Datum:
+    """Where the origin of the site is on the Earth."""
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class RobotOptions:
     name: str
     pose: str
@@ -22,6 +31,9 @@ class RobotOptions:
     max_yaw_rate_radps: float = 6.0
     gap_s: float = 0.5
     origin: FrameOrigin = FrameOrigin()
+    error_m: float = 0.02
+    error_mps: float = 0.05
+    datum: Datum | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,17 +11,24 @@ from dataclasses import dataclass
 from statistics import fmean
 from typing import Final
 
-from sern_client.endpoints.twin.bodies import Planned, Pose
+from sern_client.endpoints.twin.bodies import Planned, Pose, Said
 from sern_client.endpoints.twin.options import RobotOptions
 from sern_core.vocabulary.errors import BodyError
 from sern_twin.acceleration import Accelerations
+from sern_twin.fixes import Fixes
 from sern_twin.following import MOVES_MPS, Following
+from sern_twin.geodesy import TangentPlane
 from sern_twin.motion import Motion
 from sern_twin.predictors import ConstantAcceleration, PlanTracking, Predictor
-from sern_twin.synchroniser import TAKEN, Gap, Outcome, Synchroniser, SynchroniserOptions, Twin
+from sern_twin.synchroniser import JUMP_M, TAKEN, Gap, Outcome, Synchroniser, SynchroniserOptions, Twin
 from sern_twin.trajectory import Trajectory, Waypoint
 from sern_twin.way import PathTracking, Way
 
+SITE_FRAME: Final = "map"
+"""The frame of what satellites place."""
+NO_FIX: Final = "no_fix"
+JUMP_ERRORS: Final = 3.0
+"""What is further off than so many times its error is a jump."""
 LEARNS_S: Final = 2.0
 """How often what was learned of a plan goes into the prediction."""
 SPEED_SAMPLES: Final = 50
@@ -43,6 +50,11 @@ class RobotTwin:
     def __init__(self, options: RobotOptions) -> None:
         self.options = options
         self.frame = Frame("", "", 0.0)
+        datum = options.datum
+        self._fixes: Fixes | None = None
+        if datum is not None:
+            self._fixes = Fixes(TangentPlane.from_degrees(datum.latitude_deg, datum.longitude_deg, datum.height_m))
+        self._without_fix = 0
         self.refused: Counter[str] = Counter()
         self.gaps = 0
         self.violated = 0
@@ -53,6 +65,9 @@ class RobotTwin:
                 max_speed_mps=options.max_speed_mps,
                 max_yaw_rate_radps=options.max_yaw_rate_radps,
                 gap_s=options.gap_s,
+                error_m=options.error_m,
+                error_mps=options.error_mps,
+                jump_m=max(JUMP_M, JUMP_ERRORS * options.error_m),
             ),
         )
         self._following: Following | None = None
@@ -66,7 +81,8 @@ class RobotTwin:
 
     @property
     def counts(self) -> dict[str, int]:
-        return {outcome.value: count for outcome, count in self._synchroniser.counts.items()}
+        counts = {outcome.value: count for outcome, count in self._synchroniser.counts.items()}
+        return counts if self._fixes is None else {**counts, NO_FIX: self._without_fix}
 
     @property
     def snaps(self) -> int:
@@ -99,18 +115,35 @@ class RobotTwin:
         """`taken_ns`: when the robot's client took the message, by its own clock, which is `age_s` ago."""
         stamp_s = now - age_s - (taken_ns - pose.stamp_ns) / 1e9
         motion = self._accelerations.of(stamp_s, pose.motion)
+        outcome = self._measured(stamp_s, motion, Frame(pose.frame_id, pose.child_frame_id, pose.z_m), now)
+        if outcome in TAKEN:
+            self._accelerations.took(stamp_s, motion)
+        return outcome
+
+    def fix(self, said: Said, *, taken_ns: int, age_s: float, now: float) -> Outcome | None:
+        """The same for what satellites say. None: they say nothing; that is counted."""
+        if self._fixes is None or not said.fix.valid:
+            self._without_fix += 1
+            return None
+        stamp_s = now - age_s - (taken_ns - said.stamp_ns) / 1e9
+        motion, z_m = self._fixes.motion(stamp_s, said.fix)
+        outcome = self._measured(stamp_s, motion, Frame(SITE_FRAME, said.frame_id, z_m), now)
+        if outcome in TAKEN:
+            self._fixes.took(stamp_s, motion, anew=outcome is not Outcome.TAKEN)
+        return outcome
+
+    def _measured(self, stamp_s: float, motion: Motion, frame: Frame, now: float) -> Outcome:
         outcome, gap = self._synchroniser.measured(stamp_s, motion, now=now)
         if gap is not None:
             self._report(gap)
         if outcome in TAKEN:
-            if self.frame.frame_id not in ("", pose.frame_id):
+            if self.frame.frame_id not in ("", frame.frame_id):
                 _log.warning(
                     "%s: %s is in frame %r now, and was in %r: a plan of the old frame is dropped",
-                    self.options.name, self.options.pose, pose.frame_id, self.frame.frame_id,
+                    self.options.name, self.options.pose, frame.frame_id, self.frame.frame_id,
                 )  # fmt: skip
                 self._drop_plan()
-            self.frame = Frame(pose.frame_id, pose.child_frame_id, pose.z_m)
-            self._accelerations.took(stamp_s, motion)
+            self.frame = frame
             self._heard.append((stamp_s, motion))
             del self._heard[:-SPEED_SAMPLES]
             if self._following is not None:
