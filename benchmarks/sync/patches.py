@@ -70,6 +70,9 @@ class End:
         client.core.subscribe_objects([Selection(ObjectKind.PATCH, "/scene/.*")], now=client.now)
 
     def put(self, object_id: str, kind: ObjectKind, type_name: str, *, value: bytes = b"", **_more: Any) -> None:
+        if kind is not ObjectKind.PATCH:
+            self.client.core.objects.put(object_id, kind, type_name, wall_ns=0, now=self.client.now, value=value)
+            return
         self.put_bytes.append(len(value))
         self.puts[object_id] = self.client.now
         self.said.append((self.client.now, object_id, _version(value)))

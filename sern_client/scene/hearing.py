@@ -51,6 +51,8 @@ class Scanner:
         self._unused = unused
         self._poses: deque[Said] = deque(maxlen=POSES)
         self._scan: Scan | None = None
+        self.place_m: tuple[float, float] | None = None
+        """Where it was when it scanned last."""
 
     def pose(self, body: bytes, encoding: Encoding) -> None:
         """BodyError: it is none."""
@@ -81,6 +83,7 @@ class Scanner:
         if where is None:
             self._unused[Unused.NO_POSE] += 1
             return None
+        self.place_m = where[:2]
         return Placed(where, scan)
 
     def _at(self, stamp_ns: int) -> tuple[float, float, float] | None:

@@ -41,6 +41,7 @@ def make_scene(
         from sern_client.scene.options import ScannerOptions, SceneOptions
         from sern_twin.geodesy import TangentPlane
         from sern_twin.world.grid import Grid
+        from sern_twin.world.update_rates import UpdateRateOptions
     except ImportError as error:
         raise ConfigError(f"a scene needs more packages: {installing('sern[twin]')} ({error})", key="scene") from error
     at = section.origin
@@ -69,7 +70,8 @@ def make_scene(
             raise ConfigError(
                 f"sern-twin publishes it as {names[key]}: remove the line", file=str(loaded.path), key=f"scene.{key}"
             )
-    options = SceneOptions(section.name, scanners, section.obstacles, **names)
+    rates = UpdateRateOptions(**section.rates.model_dump())
+    options = SceneOptions(section.name, scanners, section.obstacles, **names, rates=rates)
     return SceneNode(
         options,
         grid,

@@ -40,6 +40,7 @@ from sern_twin.world.offset import object_offset
 from sern_twin.world.patches import LAYERS, OCCUPIED, UNKNOWN, BlockKey, Cells, Refusal, read_header
 from sern_twin.world.scene import Scene
 from sern_twin.world.terrain import Terrain
+from sern_twin.world.update_rates import UpdateRates
 
 PERIOD_S: Final = 0.1
 WHOLE_S: Final = 5.0
@@ -96,6 +97,7 @@ class SceneNode:
         self._wall_ns = wall_ns
         self._prefix = f"/scene/{options.name}/"
         self._scanners = [Scanner(each, grid, self.unused) for each in options.scanners]
+        self._rates = UpdateRates(grid, options.rates)
         self._pose_error_m = max((each.pose_error_m for each in options.scanners), default=0.0)
         self.obstacles = Obstacles(grid, self.unused)
         self._writer = bodies.Writer(grid, encoding)
@@ -233,13 +235,17 @@ class SceneNode:
         if self.obstacles.changed:
             self.obstacles.changed = False
             self._paint()
-        for key in self.scene.publish():
+        now = self._now()
+        added = self.scene.merged("twin_only") >= OCCUPIED
+        self._rates.look([scanner.place_m for scanner in self._scanners if scanner.place_m], added, now=now)
+        for key in self.scene.publish({"live": self._rates.due(now)}):
             self._change(key)
+            if key.layer == "live":
+                self._rates.told(key.block, now)
             try:
                 self._objects.put(self._id(key), ObjectKind.PATCH, PATCH_TYPE, value=self.scene.encode_block(key))
             except (RefusedError, UsageError) as error:
                 self._said(f"scene: {error}", type(error).__name__)
-        now = self._now()
         self.differing.tell(now)
         self._publish(now)
         self._publish_discrepancies(now)

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from sern_twin.world.update_rates import UpdateRateOptions
+
 
 @dataclass(frozen=True, slots=True)
 class ScannerOptions:
@@ -20,3 +22,4 @@ class SceneOptions:
     obstacles: str | None = None
     publish: str = "/scene/map"
     discrepancies: str = "/scene/discrepancies"
+    rates: UpdateRateOptions | None = None

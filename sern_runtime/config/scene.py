@@ -42,6 +42,28 @@ class OriginSection(Section):
     """Above the ellipsoid, or whatever the elevation model has its heights above."""
 
 
+class UpdateRateSection(Section):
+    """How often what scanners see is told, by how far it is from them. Where somebody added something counts as near
+    them."""
+
+    important_m: Annotated[float, Field(ge=0, le=10_000)] = 8.0
+    """Blocks so near a scanner are told as often as they change, ten times a second at most."""
+    near_m: Annotated[float, Field(gt=0, le=10_000)] = 8.0
+    """Blocks so near those are told every `medium_s`."""
+    far_m: Annotated[float, Field(gt=0, le=10_000)] = 12.0
+    """They are so until they are so far away. More than `near_m`."""
+    medium_s: Annotated[float, Field(ge=0, le=60)] = 0.5
+    """How often blocks near those are told, at most."""
+    low_s: Annotated[float, Field(ge=0, le=600)] = 2.0
+    """How often all others are told, at most."""
+
+    @model_validator(mode="after")
+    def _rises(self) -> "UpdateRateSection":
+        if self.near_m >= self.far_m:
+            raise fault(f"{self.far_m} is to be more than near_m, {self.near_m}", "far_m")
+        return self
+
+
 class SceneSection(Section):
     """The scene that sites share: what their scanners see and what people add, as one map at each site. All sites of a
     scene need the same name and grid."""
@@ -75,6 +97,8 @@ class SceneSection(Section):
     terrain: PathText | None = None
     """An elevation model of the site, such as a GeoTIFF: the ground on which the page of sern-twin shows it, with the
     buildings of `base`."""
+    rates: UpdateRateSection = UpdateRateSection()
+    """How often what scanners see here is told."""
     publish: TopicText = "/scene/map"
     """Where the map is published here: nav_msgs/OccupancyGrid, and what changes beside it under NAME_updates. sern-twin
     publishes it for all sites as PREFIX/scene/map."""

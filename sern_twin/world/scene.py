@@ -137,15 +137,20 @@ class Scene:
         own[rows, columns][inside] = value
         return int(np.count_nonzero(inside))
 
-    def publish(self) -> tuple[BlockKey, ...]:
+    def publish(self, due: Mapping[str, NDArray[np.bool_]] | None = None) -> tuple[BlockKey, ...]:
         """Give a version to each block of this writer that differs from what was published: those are to be sent.
+
+        `due`: which blocks of a layer may be, (blocks,); all of one that it does not name.
 
         UsageError: there is no version left.
         """
         found: list[BlockKey] = []
         for layer, own in self._set.items():
             plane = self._plane(self.writer, layer)
-            differs = {*self.grid.blocks_where(own != plane.cells).tolist()}
+            blocks = self.grid.blocks_where(own != plane.cells)
+            if due is not None and layer in due:
+                blocks = blocks[due[layer][blocks]]
+            differs = {*blocks.tolist()}
             differs |= {key.block for key in self._again if key.layer == layer}
             found += [BlockKey(self.writer, layer, block) for block in sorted(differs)]
         if found:

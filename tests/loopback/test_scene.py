@@ -88,6 +88,7 @@ async def test_the_twin_publishes_the_scene_and_what_is_wrong_in_it_for_a_site_w
         ({**SCENE, "base": "streets.osm"}, "scene.origin: is needed for base"),
         ({**SCENE, "origin": {"latitude_deg": 1, "longitude_deg": 2}, "base": "none.osm"}, "none.osm: no such file"),
         ({**SCENE, "name": "A yard"}, "scene.name: "),
+        ({**SCENE, "rates": {"near_m": 20}}, "scene.rates.far_m: 12.0 is to be more than near_m, 20.0"),
         ({**SCENE, "scanners": [{"scan": "/scan"}]}, "scene.scanners.0.pose: "),
     ],
 )
