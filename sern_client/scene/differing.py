@@ -21,7 +21,7 @@ from sern_twin.world.patches import Cells
 
 TYPE: Final = "sern/Discrepancy"
 TOLD_S: Final = 0.5
-"""A discrepancy that grows, as the robot comes nearer, is told so often at most."""
+"""A discrepancy that grows, as the robot comes nearer, is told so often at most, and is over after so long."""
 MOST_OF_OTHERS: Final = 256
 
 
@@ -48,6 +48,8 @@ class SceneDiscrepancies:
         self._world = Discrepancies(grid)
         self._found: tuple[Discrepancy, ...] = ()
         self._told: dict[int, tuple[Discrepancy, float]] = {}
+        self._gone_s: dict[int, float] = {}
+        """Since when those that were told are found no more."""
         self._all: dict[str, SeenDiscrepancy] = {}
 
     @property
@@ -68,8 +70,12 @@ class SceneDiscrepancies:
     def tell(self, now_s: float) -> None:
         """Tell the others what was found, and what is over."""
         found = {each.number: each for each in self._found}
+        for number in found.keys() & self._gone_s.keys():
+            del self._gone_s[number]
         for number in self._told.keys() - found.keys():
-            del self._told[number]
+            if now_s - self._gone_s.setdefault(number, now_s) < TOLD_S:
+                continue  # it may be back with the next scan
+            del self._told[number], self._gone_s[number]
             self._objects.delete(self._id(number))
             self._all.pop(self._id(number), None)
             self.changes += 1

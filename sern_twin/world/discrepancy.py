@@ -28,6 +28,8 @@ POSE_ERRORS: Final = 2.0
 """The match radius is so many times how far off the robot's pose may be."""
 LEAST_CELLS: Final = 2
 """One cell alone is not said: it flickers at the edges of things."""
+KEEPS_S: Final = 2.0
+"""A thing that was gone for no longer has the number that it had."""
 MOST: Final = 64
 """The largest are said where there are more."""
 Mask = NDArray[np.bool_]
@@ -87,7 +89,8 @@ class Discrepancies:
         self._passes: NDArray[np.uint8] = np.zeros(grid.shape, np.uint8)
         """The same: a ray passed."""
         self._found: dict[DiscrepancyKind, Mask] = {kind: np.zeros(grid.shape, np.bool_) for kind in DiscrepancyKind}
-        self._now: list[tuple[Discrepancy, NDArray[np.int64]]] = []
+        self._known: list[tuple[Discrepancy, NDArray[np.int64], float]] = []
+        """Those of the last moments, with their cells and when they were found last; the newest first."""
         self._numbers = 0
         self.left_out = 0
 
@@ -139,8 +142,7 @@ class Discrepancies:
         found = [each for kind, mask in self._found.items() for each in self._joined(kind, mask, now_s)]
         found.sort(key=lambda each: -each[0].cells)
         self.left_out = max(0, len(found) - MOST)
-        self._now = self._numbered(found[:MOST])
-        return tuple(discrepancy for discrepancy, _cells in self._now)
+        return self._numbered(found[:MOST], now_s)
 
     def _joined(self, kind: DiscrepancyKind, mask: Mask, now_s: float) -> list[tuple[Discrepancy, NDArray[np.int64]]]:
         """Cells that touch, or have two others between them at the most, are one thing."""
@@ -163,23 +165,24 @@ class Discrepancies:
         return found
 
     def _numbered(
-        self, found: Sequence[tuple[Discrepancy, NDArray[np.int64]]]
-    ) -> list[tuple[Discrepancy, NDArray[np.int64]]]:
+        self, found: Sequence[tuple[Discrepancy, NDArray[np.int64]]], now_s: float
+    ) -> tuple[Discrepancy, ...]:
         """Each takes the number of the one before with which it has the most cells in common."""
-        left = list(self._now)
+        left = [known for known in self._known if now_s - known[2] <= KEEPS_S][: 2 * MOST]
         made = []
         for thing, cells in found:
             shared = [
                 np.isin(cells, before, assume_unique=True).sum() if known.kind is thing.kind else 0
-                for known, before in left
+                for known, before, _last_s in left
             ]
             if shared and max(shared) > 0:
-                known, _before = left.pop(int(np.argmax(shared)))
-                made.append((replace(thing, number=known.number, since_s=known.since_s), cells))
+                known = left.pop(int(np.argmax(shared)))[0]
+                made.append((replace(thing, number=known.number, since_s=known.since_s), cells, now_s))
             else:
                 self._numbers += 1
-                made.append((replace(thing, number=self._numbers), cells))
-        return made
+                made.append((replace(thing, number=self._numbers), cells, now_s))
+        self._known = made + left
+        return tuple(thing for thing, _cells, _last_s in made)
 
 
 def _beyond(cells: Mask, others: Mask, radius_cells: float) -> Mask:

@@ -59,7 +59,7 @@ def test_what_is_added_where_the_robot_sees_nothing_is_a_phantom_in_less_than_a_
     assert [(each["id"], each["seen_by"]) for each in told_of] == [("/scene/yard/discrepancy/1@robot", "robot")]
     site.marker(action=2)
     site.turn()
-    drive(robot, around(9.0, 9.0, 0.1))
+    drive(robot, around(9.0, 9.0, 0.1), scans=8)
     site.now += 1.0
     site.turn()
     assert site.node.discrepancies() == () and markers(site) == [], "it was taken back"
@@ -79,7 +79,7 @@ def test_what_the_robot_sees_where_the_map_is_free_is_an_unknown_obstacle() -> N
     assert obstacle.east_m == pytest.approx(1.8, abs=0.15) and obstacle.north_m == pytest.approx(0.0, abs=0.1)
     assert [each.object_id for each in site.node.discrepancies()] == [obstacle.object_id]
     assert markers(site)[1].text == "unknown obstacle: robot sees it"
-    drive(robot, around(9.0, 9.0, 0.1), scans=5)
+    drive(robot, around(9.0, 9.0, 0.1), scans=10)
     assert robot.node.discrepancies() == site.node.discrepancies() == (), "the car has left"
 
 
@@ -159,3 +159,23 @@ def test_a_localisation_that_is_off_makes_no_discrepancies_of_what_is_there() ->
         robot.scan(around(9.0, 9.0, 0.1, beams=360), 1.0 + robot.now)
         robot.turn()
         assert robot.node.discrepancies() == ()
+
+
+def test_what_flickers_is_one_discrepancy_and_ends_once() -> None:
+    """A thing at the edge of what is seen: found and not found, scan by scan."""
+    site, robot = a_pair()
+    site.marker(x_m=2.0, y_m=0.0, size_m=0.6)
+    site.turn()
+    said: list[tuple[str, str]] = []
+    robot.air.put = lambda _client, object_id, kind, *_more: (  # type: ignore[method-assign]
+        said.append(("put", object_id)) if kind is ObjectKind.DISCREPANCY else None
+    )
+    robot.air.delete = lambda client, object_id: said.append(("delete", object_id))  # type: ignore[method-assign]
+    there, gone = robot.node.twin_cells(), np.full(GRID.shape, -1, np.int8)
+    for step in range(40):
+        robot.node.twin_cells = lambda step=step: gone if step % 3 == 2 else there  # type: ignore[method-assign, misc]
+        drive(robot, around(9.0, 9.0, 0.1))
+    robot.node.twin_cells = lambda: gone  # type: ignore[method-assign]
+    drive(robot, around(9.0, 9.0, 0.1), scans=10)
+    assert {object_id for _what, object_id in said} == {"/scene/yard/discrepancy/1@robot"}
+    assert [what for what, _id in said if what == "delete"] == ["delete"] and said[-1][0] == "delete"

@@ -107,7 +107,11 @@ def test_a_number_stays_while_a_thing_does_and_is_not_used_again() -> None:
     scans(world, 3)
     assert world.compare(twin(), now_s=4.0) == ()
     scans(world, 3, first)
-    assert [each.number for each in world.compare(twin(), now_s=5.0)] == [3]
+    assert [(each.number, each.since_s) for each in world.compare(twin(), now_s=5.0)] == [(1, 1.0)], "it flickered"
+    scans(world, 3)
+    assert world.compare(twin(), now_s=6.0) == ()
+    scans(world, 3, first)
+    assert [(each.number, each.since_s) for each in world.compare(twin(), now_s=9.0)] == [(3, 9.0)]
 
 
 def test_a_cell_changes_its_mind_with_three_of_the_last_five_scans_that_saw_it() -> None:
