@@ -4,7 +4,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 TEST_PROCESSES ?= 3
 RANDOM_TESTS = $(shell grep -rlE '^(from|import) (hypothesis|tests\.exploring)' tests --include='test_*.py' | grep -v tests/peers)
-PACKAGES := sern_core sern_runtime sern_relay sern_client sern_sim sern_twin sern_tools benchmarks tests
+PACKAGES := sern_core sern_runtime sern_relay sern_client sern_sim sern_twin sern_perception sern_tools benchmarks tests
 
 # What a process compiles it keeps (__pycache__) for the next one, whatever the environment says: a daemon starts with a
 # quarter less of CPU, and each worker of the tests would rewrite all of them anew.
@@ -34,7 +34,7 @@ PYTHON_HAS := import sys; print("%d.%d" % sys.version_info[:2]); sys.exit(sys.ve
 $(VENV)/.ready: pyproject.toml constraints.txt
 	@has=$$($(PYTHON) -c '$(PYTHON_HAS)') || { echo "$(PYTHON) is Python $$has, $(PYTHON_NEEDED)" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,bench,report,lossy,dds,zenoh,twin,geo,sim,viz]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,bench,report,lossy,dds,zenoh,twin,geo,sim,viz,seg]'
 	@touch $@
 
 setup: $(VENV)/.ready
@@ -66,7 +66,7 @@ COMPILED := $(VENV)-compiled
 CORE_TESTS := tests/sern_core tests/sern_sim tests/fuzz tests/test_vectors.py tests/test_compiled.py
 compiled: wheel
 	$(PYTHON) -m venv $(COMPILED)
-	$(COMPILED)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt "$$(ls dist/sern-*.whl)[dev,bench,report,lossy,dds,zenoh,twin,geo,sim,viz]"
+	$(COMPILED)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt "$$(ls dist/sern-*.whl)[dev,bench,report,lossy,dds,zenoh,twin,geo,sim,viz,seg]"
 	$(COMPILED)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --force-reinstall dist/sern-*.whl
 	mkdir -p build/checkout
 	ln -sfn ../../tests build/checkout/tests

@@ -123,7 +123,7 @@ class MujocoJackal:
         self._random = random
         self._sensor_random = Random(random.getrandbits(64))
         self._noise = np.random.default_rng(random.getrandbits(64))
-        self._stand(start)
+        self.stand(start)
 
     def drive(self, speed_mps: float, yaw_rate_radps: float) -> None:
         """A velocity command, in force until the next. Not a finite number: ValueError."""
@@ -167,7 +167,7 @@ class MujocoJackal:
         """Planar LiDAR: (beams,) ranges in metres from -span/2 to +span/2, inf where nothing is in range."""
         bearings = np.linspace(-span_rad / 2, span_rad / 2, beams)
         rays = np.stack([np.cos(bearings), np.sin(bearings), np.zeros(beams)], axis=1)
-        ranges, _ = self._cast((0.0, 0.0, LIDAR_HEIGHT_M), rays)
+        ranges, _ = self.cast((0.0, 0.0, LIDAR_HEIGHT_M), rays)
         ranges = ranges + self._noise.normal(0.0, RANGE_NOISE_M, beams)
         return np.where(ranges <= LIDAR_RANGE_M, np.maximum(ranges, NEAR_M), np.inf).astype(np.float32)
 
@@ -180,7 +180,7 @@ class MujocoJackal:
         rays[..., 0] = np.cos(bearings) * np.cos(RINGS_RAD)
         rays[..., 1] = np.sin(bearings) * np.cos(RINGS_RAD)
         rays[..., 2] = np.sin(RINGS_RAD)
-        ranges, labels = self._cast((0.0, 0.0, LIDAR_HEIGHT_M), rays.reshape(-1, 3))
+        ranges, labels = self.cast((0.0, 0.0, LIDAR_HEIGHT_M), rays.reshape(-1, 3))
         pick = (np.arange(azimuths) * cast) // azimuths
         ranges, labels = ranges.reshape(cast, -1)[pick], labels.reshape(cast, -1)[pick]
         ranges = ranges + self._noise.normal(0.0, RANGE_NOISE_M, ranges.shape)
@@ -199,7 +199,7 @@ class MujocoJackal:
         left, up = np.meshgrid(np.linspace(0.6, -0.6, columns), np.linspace(0.45, -0.45, rows))
         rays = np.stack([np.ones_like(left), left, up], axis=-1).reshape(-1, 3)
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        ranges, labels = self._cast(_CAMERA_M, rays)
+        ranges, labels = self.cast(_CAMERA_M, rays)
         shade = np.where(ranges <= LIDAR_RANGE_M, 1.0 / (1.0 + ranges / 15.0), 1.0)
         frame = (_COLOURS[np.where(ranges <= LIDAR_RANGE_M, labels, 0)] * shade[:, None]).reshape(rows, columns, 3)
         frame = np.repeat(np.repeat(frame, coarse, axis=0), coarse, axis=1)[:height, :width]
@@ -207,10 +207,22 @@ class MujocoJackal:
         clipped: NDArray[np.uint8] = np.clip(frame, 0, 255).astype(np.uint8)
         return clipped
 
-    # Parts
+    def cast(self, at_m: tuple[float, float, float], rays: Floats) -> tuple[Floats, NDArray[np.uint16]]:
+        """Unit `rays` (n, 3) in the axes of the body, from a place of it, and without noise: ranges [m] (n,), inf where
+        nothing is, and the `Label` of each."""
+        turned = self._turned()
+        origin = np.array(self._data.qpos[:3]) + turned @ np.array(at_m)
+        directions = np.ascontiguousarray(rays @ turned.T).reshape(-1)
+        met, ranges = np.full(len(rays), -1, dtype=np.int32), np.full(len(rays), -1.0)
+        # Beyond the range nothing is looked for; the noise may take back what is just beyond.
+        self._mujoco.mj_multiRay(
+            self._model, self._data, origin, directions, self._seen, 1, -1, met, ranges, None, len(rays),
+            LIDAR_RANGE_M + 1.0,
+        )  # fmt: skip
+        return np.where(met < 0, np.inf, ranges), np.where(met < 0, 0, self._labels[met]).astype(np.uint16)
 
-    def _stand(self, start: Pose2) -> None:
-        """Let it down on the ground, and wait until it stands still."""
+    def stand(self, start: Pose2) -> None:
+        """Let it down on the ground there, and wait until it stands still; what it has counted begins anew."""
         data = self._data
         highest = max(
             self.world.height_m(start.x_m + x, start.y_m + y) for x in (-0.3, 0.0, 0.3) for y in (-0.3, 0.0, 0.3)
@@ -224,6 +236,8 @@ class MujocoJackal:
         here = Pose2(x, y, yaw)
         self._wheel_from = [float(data.qpos[at]) for at in self._wheel_at]
         self.state = RobotState(pose=here, odometry=here, z_m=z, roll_rad=roll, pitch_rad=pitch)
+
+    # Parts
 
     def _check(self) -> None:
         warnings = self._mujoco.mjtWarning
@@ -283,19 +297,6 @@ class MujocoJackal:
             roll_rad=roll,
             pitch_rad=pitch,
         )
-
-    def _cast(self, at_m: tuple[float, float, float], rays: Floats) -> tuple[Floats, NDArray[np.uint16]]:
-        """Unit `rays` (n, 3) in the body's axes from a place of it: ranges (n,), inf where nothing is, and labels."""
-        turned = self._turned()
-        origin = np.array(self._data.qpos[:3]) + turned @ np.array(at_m)
-        directions = np.ascontiguousarray(rays @ turned.T).reshape(-1)
-        met, ranges = np.full(len(rays), -1, dtype=np.int32), np.full(len(rays), -1.0)
-        # Beyond the range nothing is looked for; the noise may take back what is just beyond.
-        self._mujoco.mj_multiRay(
-            self._model, self._data, origin, directions, self._seen, 1, -1, met, ranges, None, len(rays),
-            LIDAR_RANGE_M + 1.0,
-        )  # fmt: skip
-        return np.where(met < 0, np.inf, ranges), np.where(met < 0, 0, self._labels[met]).astype(np.uint16)
 
 
 _COLOURS: Final = np.array(
