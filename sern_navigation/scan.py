@@ -1,12 +1,12 @@
 """The obstacle scan of a cloud: what stands in the way at each bearing, and where the ground ends.
 
-The paper's S_2D(r, θ) = min_z L_3D(r, θ, z) collapses the height of a cloud. Here the ground is taken out first, bearing
-by bearing: from the robot outwards a point is ground where the way to it from the ground before is not too steep
+The paper's S_2D(r, θ) = min_z L_3D(r, θ, z) collapses the height of a cloud. Here the ground is taken out first, by
+bearing: from the robot outwards a point is ground where the way to it from the ground before is not too steep
 (Himmelsbach et al., IV 2010, with a walk in place of fitted lines), so that hills are no obstacles and low things are.
 Ground that drops away, or that no ray meets where one should, is an obstacle too: its edge is.
 
-A ray shows only what it passes: a log of 20 cm that is below all rays is not gone. So a scan also says, for each bearing
-and distance, how low the lowest ray passed.
+A ray shows only what it passes: a log of 20 cm that is below all rays is not gone. So a scan also says how low the
+lowest ray passed, for each bearing and distance.
 """
 
 import math
@@ -79,8 +79,9 @@ class ScanOptions:
     max_slope_rad: float = 0.35
     max_rise_rad: float = 0.26
     """How much steeper than the ground before it ground may be."""
-    max_fall_rad: float = 0.10
-    """The same downwards, up to `drop_range_m`: behind an edge the next ray meets ground far away, little lower."""
+    max_fall_rad: float = 0.13
+    """The same downwards, up to `drop_range_m`: behind an edge the next ray meets ground far away, little lower. Ground
+    that falls half as much and then rises steeply is a ditch."""
     step_m: float = 0.06
     """A step up that is driven over, and half as much more downwards."""
     drop_range_m: float = 4.0
@@ -157,7 +158,7 @@ def obstacle_scan(cloud: Cloud, options: ScanOptions) -> ObstacleScan | Refused:
         return points
     finite = np.isfinite(points).all(axis=1)
     if not finite.any() or not math.isfinite(cloud.stamp_s):
-        return Refused(Unusable.NOT_FINITE, f"a cloud of {len(points)} points of which none is finite, or without a time")
+        return Refused(Unusable.NOT_FINITE, f"a cloud of {len(points)} points, none of them finite, or without a time")
     return _Reading(points[finite] - np.array(options.origin_m, np.float32), options).scan(cloud.stamp_s)
 
 
@@ -170,7 +171,7 @@ def planar_scan(
     """
     ranges, angles = np.asarray(ranges_m, np.float64), np.asarray(angles_rad, np.float64)
     if ranges.ndim != 1 or ranges.shape != angles.shape or len(ranges) > MOST_POINTS:
-        return Refused(Unusable.SHAPE, f"a scan of {ranges.shape} ranges and {angles.shape} angles: give as many of each")
+        return Refused(Unusable.SHAPE, f"a scan of {ranges.shape} ranges, {angles.shape} angles: give as many of each")
     if not len(ranges):
         return Refused(Unusable.EMPTY, "a scan without ranges")
     used = np.isfinite(angles) & (ranges >= options.range_min_m)
@@ -194,15 +195,13 @@ def planar_scan(
 
 
 def _columns(points: NDArray[Any]) -> NDArray[np.float32] | Refused:
-    if not isinstance(points, np.ndarray):
-        return Refused(Unusable.SHAPE, f"a cloud that is a {type(points).__name__}: give an array of numbers")
     if points.dtype.names is not None:
         missing = [name for name in ("x", "y", "z") if name not in points.dtype.names]
         if missing:
             return Refused(Unusable.FIELDS, f"a cloud without the field {missing[0]}: it has {points.dtype.names}")
         points = np.stack([points[name].reshape(-1) for name in ("x", "y", "z")], axis=1)
     if points.dtype.kind not in "fiu" or points.ndim != 2 or points.shape[1] < 3:
-        return Refused(Unusable.SHAPE, f"a cloud of {points.shape} {points.dtype}: give a row of x, y, z for each point")
+        return Refused(Unusable.SHAPE, f"a cloud of {points.shape} {points.dtype}: give rows of x, y, z")
     if not len(points):
         return Refused(Unusable.EMPTY, "a cloud without points")
     if len(points) > MOST_POINTS:
@@ -212,7 +211,8 @@ def _columns(points: NDArray[Any]) -> NDArray[np.float32] | Refused:
 
 
 def _sectors(bearings_rad: NDArray[np.floating[Any]], sectors: int) -> Indices:
-    return np.floor((bearings_rad + math.pi) * (sectors / _TURN)).astype(np.intp) % sectors
+    found: Indices = np.floor((bearings_rad + math.pi) * (sectors / _TURN)).astype(np.intp) % sectors
+    return found
 
 
 class _Reading:
@@ -279,6 +279,7 @@ class _Reading:
             np.float32(math.tan(angle)) for angle in (options.max_slope_rad, options.max_rise_rad, options.max_fall_rad)
         )
         at_r, at_z, slope = (np.zeros(options.sectors, np.float32) for _ in range(3))
+        ditch_m = np.full(options.sectors, np.inf)  # the edge of one, if what comes next is its other side
         for number in range(self._shape[0]):
             there = np.isfinite(low_z[number])
             if there.any():
@@ -289,13 +290,14 @@ class _Reading:
                 too_steep = (up > options.step_m) & ((tilt > steepest) | (bend > rise))
                 sunk = bend * along < -1.5 * options.step_m
                 falls = sunk & ((tilt < -steepest) | ((bend < -fall) & (at_r <= options.drop_range_m)))
-                if falls.any():
-                    ray = (self._height_m - low_z[number][falls]) / low_r[number][falls]
-                    ahead = (self._height_m - at_z[falls] + slope[falls] * at_r[falls]) / (slope[falls] + ray)
-                    # The edge lies between the last ground and where the ray goes below it; the middle is least off.
-                    edge = np.maximum((at_r[falls] + ahead) / 2, ahead - 0.25)
-                    ground.edges_m[falls] = np.minimum(ground.edges_m[falls], np.maximum(edge, options.range_min_m))
+                dips = sunk & (bend < -fall / 2) & (at_r <= options.drop_range_m)
+                if dips.any() or falls.any():
+                    edges_m = self._edges_m(at_r, at_z, slope, low_r[number], low_z[number])
+                    ground.edges_m[falls] = np.minimum(ground.edges_m, edges_m)[falls]
+                    ditch_m = np.where(dips, edges_m, ditch_m)
+                ground.edges_m = np.where(too_steep, np.minimum(ground.edges_m, ditch_m), ground.edges_m)
                 is_ground = there & ~too_steep & ~falls
+                ditch_m[is_ground & ~dips] = np.inf
                 at_z = np.where(is_ground, low_z[number], at_z)
                 at_r = np.where(is_ground, low_r[number], at_r)
                 # Two points close to each other say little of a slope.
@@ -304,8 +306,26 @@ class _Reading:
             ground.z_m[number], ground.r_m[number], ground.slope[number] = at_z, at_r, slope
         return ground
 
+    def _edges_m(
+        self,
+        at_r: NDArray[np.float32],
+        at_z: NDArray[np.float32],
+        slope: NDArray[np.float32],
+        low_r: NDArray[np.float32],
+        low_z: NDArray[np.float32],
+    ) -> Floats:
+        """Where the ground ends that goes on from a place with a slope, if a ray that passes it ends lower.
+
+        The edge lies between the last ground and where the ray goes below it; the middle is the least off.
+        """
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ray = (self._height_m - low_z) / low_r
+            ahead = (self._height_m - at_z + slope * at_r) / (slope + ray)
+            edges = np.maximum((at_r + ahead) / 2, ahead - 0.25)
+        return np.maximum(edges, self._options.range_min_m).astype(np.float64)
+
     def _missing(self, ranges_m: Floats) -> Floats:
-        """Where ground is missing, (sectors,): two rings in a row that should meet it meet nothing, and all below do."""
+        """Where ground is missing, (sectors,): two rings that should meet it meet nothing, and all below them do."""
         options = self._options
         edges_m = np.full(options.sectors, np.inf)
         rings = np.array(sorted(angle for angle in options.ring_elevations_rad if angle < 0))
@@ -346,7 +366,9 @@ class _Reading:
         beyond = np.minimum.accumulate(flattest.reshape(self._shape)[::-1], axis=0)[::-1]
         lowest = np.full(self._shape, np.inf, np.float32)
         middle = ((self._bins_m[1:] + self._bins_m[:-1]) / 2).astype(np.float32)[:-1, None]
-        lowest[:-1] = np.float32(self._height_m) + middle * beyond[1:] - ground.z_m[:-1]
+        level = ground.z_m[:-1] + ground.slope[:-1] * (middle - ground.r_m[:-1])
+        lowest[:-1] = np.float32(self._height_m) + middle * beyond[1:] - level
+        lowest[lowest < -1.5 * self._options.step_m] = np.inf  # a ray below the ground goes over a hole
         lowest[ground.seen] = 0.0
         return np.maximum(lowest, 0)
 

@@ -1,6 +1,6 @@
 """The values of a costmap's cells, as in nav2_costmap_2d/cost_values.hpp, and a costmap to read."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -38,7 +38,8 @@ class Costmap:
 
     def blocked(self) -> Mask:
         """Where the middle of the robot cannot be, (rows, columns). What is unknown is not blocked."""
-        return (self.costs == LETHAL_OBSTACLE) | (self.costs == INSCRIBED_INFLATED_OBSTACLE)
+        found: Mask = (self.costs == LETHAL_OBSTACLE) | (self.costs == INSCRIBED_INFLATED_OBSTACLE)
+        return found
 
     def weights(self) -> Floats:
         """Real and soft cost together, (rows, columns), 0 to 507; unknown counts 255, as in nav2_smac_planner."""
@@ -76,6 +77,16 @@ class Window:
         return (
             slice(self.first_row - other.first_row, self.end_row - other.first_row),
             slice(self.first_column - other.first_column, self.end_column - other.first_column),
+        )
+
+    def grid_of(self, grid: Grid) -> Grid:
+        """The grid of these cells alone. UsageError: there are none."""
+        return replace(
+            grid,
+            west_m=grid.west_m + self.first_column * grid.cell_m,
+            south_m=grid.south_m + self.first_row * grid.cell_m,
+            columns=self.end_column - self.first_column,
+            rows=self.end_row - self.first_row,
         )
 
 

@@ -54,9 +54,7 @@ class StaticLayer:
         if outcome is MapOutcome.TAKEN:
             threshold = self._options.lethal_cost_threshold
             values = cells.astype(np.int64)
-            between = (
-                np.zeros_like(values) if self._options.trinary_costmap else LETHAL_OBSTACLE * values // threshold
-            )
+            between = np.zeros_like(values) if self._options.trinary_costmap else LETHAL_OBSTACLE * values // threshold
             costs = np.where(values >= threshold, LETHAL_OBSTACLE, np.maximum(between, FREE_SPACE))
             self.costs = np.where(values == UNKNOWN, NO_INFORMATION, costs).astype(np.uint8)
         return outcome
