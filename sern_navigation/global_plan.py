@@ -1,4 +1,4 @@
-"""The cheapest way over a costmap: A* on the eight neighbours of each cell, with the costs of nav2_smac_planner's 2D A*.
+"""The cheapest way over a costmap: A* on the eight neighbours of each cell, with the costs of Nav2's SmacPlanner2D.
 
 The search is scipy's Dijkstra on edges from which the heuristic is taken off, so that it expands what A* would, up to a
 bound that grows until the goal is within it. The heuristic is the shortest way without any cost, so ways are optimal.
@@ -62,7 +62,7 @@ class PlannerOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan:
-    """`code` NONE: `path_m` (n, 2) from the start to where it ends, `cost` in cells' lengths. Else `message` says why."""
+    """`code` NONE: `path_m` (n, 2) from the start on, and its `cost` in cells' lengths. Else `message` says why."""
 
     code: PlanCode
     message: str
@@ -140,8 +140,8 @@ def _within(costmap: Costmap, place_m: Point, radius_m: float) -> Indices:
     away = np.hypot(*np.moveaxis(grid.centres(rows[:, None], columns) - place_m, -1, 0)).reshape(-1)
     numbers = (rows[:, None] * grid.columns + columns).reshape(-1)
     order = np.argsort(away, kind="stable")
-    order = order[away[order] <= radius_m]
-    return numbers[order]
+    found: Indices = numbers[order[away[order] <= radius_m]]
+    return found
 
 
 def _nearest(costmap: Costmap, free: Mask, place_m: Point, radius_m: float) -> int | None:

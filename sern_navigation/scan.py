@@ -133,7 +133,7 @@ class ObstacleScan:
 
 def middles(sectors: int) -> Floats:
     """The bearings of the middles of so many sectors, from -π on."""
-    found: Floats = (np.arange(sectors) + 0.5) * (_TURN / sectors) - math.pi
+    found: Floats = (np.arange(sectors, dtype=np.float64) + 0.5) * (_TURN / sectors) - math.pi
     return found
 
 
