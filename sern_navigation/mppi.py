@@ -142,7 +142,7 @@ class Mppi:
                 continue
             trajectory = self._driven(task.pose, best)
             if not self._meets(task, trajectory):
-                return self._given(best, trajectory + [pose[0], pose[1], 0.0])
+                return self._given(best, trajectory + np.array([pose[0], pose[1], 0.0]))
         self.reset()
         return _none(ControlCode.NO_VALID_CONTROL, "every trajectory that was tried meets an obstacle")
 

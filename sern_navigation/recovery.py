@@ -1,4 +1,4 @@
-"""What a robot tries that is stuck, one thing after the other: the recovery subtree of Nav2's default behaviour tree."""
+"""What a robot tries that is stuck, one thing after the other: the recoveries of Nav2's default behaviour tree."""
 
 import math
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from sern_core.vocabulary.errors import UsageError
-from sern_navigation.costmap.costs import LETHAL_OBSTACLE, Costmap
+from sern_navigation.costmap.costs import INSCRIBED_INFLATED_OBSTACLE, LETHAL_OBSTACLE, Costmap
 from sern_twin.world.occupancy import Pose
 
 Speed = tuple[float, float]
@@ -129,7 +129,8 @@ class Recovery:
         ahead_m = min(options.backup_speed * options.simulate_ahead_time, left_m)
         places = np.linspace(0.0, -ahead_m, 2 + math.ceil(ahead_m / costmap.grid.cell_m))[1:, None]
         costs = costmap.at(places * [math.cos(pose[2]), math.sin(pose[2])] + pose[:2])
-        # A robot that touches something may get away from it; it does not get into something.
-        if (costs == LETHAL_OBSTACLE).any():
+        # A robot that touches something already may get away from it.
+        touches = costmap.at(np.array(pose[:2])) == INSCRIBED_INFLATED_OBSTACLE
+        if (costs == LETHAL_OBSTACLE).any() or (not touches and (costs == INSCRIBED_INFLATED_OBSTACLE).any()):
             return Progress.FAILED, _STILL
         return Progress.RUNNING, (-options.backup_speed, 0.0)
