@@ -24,18 +24,21 @@ import numpy as np
 
 from sern_core.vocabulary.errors import UsageError
 from sern_navigation.collision_monitor import STOPPED, Action, CollisionMonitor, MonitorOptions, Speed, Verdict
+from sern_navigation.costmap.costs import Costmap
 from sern_navigation.costmap.layered import CostmapOptions, LayeredCostmap
 from sern_navigation.costmap.static import MapOutcome
 from sern_navigation.costmap.twin import TwinView
 from sern_navigation.global_plan import Plan, PlanCode, PlannerOptions, plan
-from sern_navigation.mppi import ControlCode, Mppi, MppiOptions
+from sern_navigation.mppi import ControlCode, Mppi, MppiOptions, pruned
 from sern_navigation.recovery import Behaviour, Progress, Recovery, RecoveryOptions
 from sern_navigation.scan import Cloud, ObstacleScan, Refused, ScanOptions, obstacle_scan
-from sern_twin.world.grid import Floats, Grid
+from sern_twin.world.grid import NOWHERE, Floats, Grid
 from sern_twin.world.occupancy import MOST_M, MOST_RAD, Pose
 from sern_twin.world.patches import Cells
 
 _MARGIN_M: Final = 0.5
+_LEAST_BETWEEN_PLANS_S: Final = 0.3
+"""A path that something comes to lie on is not planned anew more often."""
 
 
 class State(StrEnum):
@@ -337,8 +340,7 @@ class Navigator:
             self._end(State.ABORTED, Code.START_OUTSIDE_MAP, f"the robot at {_said(pose)} is not on the map")
             return STOPPED, _NOWHERE
         period_s = 1 / self.options.planner_frequency if self.options.planner_frequency else math.inf
-        blocked = bool(len(self.path_m)) and self._path_blocked(local.grid, local.blocked())
-        if not len(self.path_m) or blocked or now_s - self._planned_s >= period_s:
+        if not len(self.path_m) or now_s - self._planned_s >= period_s or self._path_blocked(now_s, pose, local):
             made = self._plan(now_s, pose)
             if not made.found:
                 return self._stuck(now_s, pose, Code(made.code.value), made.message)
@@ -377,9 +379,14 @@ class Navigator:
             self.path_m, self._ever_planned = made.path_m, True
         return made
 
-    def _path_blocked(self, grid: Grid, blocked: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> bool:
-        cells = grid.flat(self.path_m)
-        return bool(blocked.reshape(-1)[cells[cells >= 0]].any())
+    def _path_blocked(self, now_s: float, pose: Pose, local: Costmap) -> bool:
+        """Whether something real has come to lie on the path ahead. What the robot touches already is no news."""
+        if now_s - self._planned_s < _LEAST_BETWEEN_PLANS_S:
+            return False
+        ahead = pruned(self.path_m, pose, self.options.local_radius_m)
+        ahead = ahead[np.hypot(*(ahead - pose[:2]).T) > self.options.planner.start_tolerance]
+        cells = local.grid.flat(ahead)
+        return bool(local.blocked().reshape(-1)[cells[cells != NOWHERE]].any())
 
     def _pursued(self) -> Goal:
         if self._goal is None:
