@@ -244,7 +244,7 @@ class _Reading:
         obstacle = (over >= options.min_obstacle_height) & (over <= options.max_obstacle_height)
         ranges_m = np.full(options.sectors, np.inf)
         np.minimum.at(ranges_m, sector[obstacle], r[obstacle].astype(np.float64))
-        edges_m = np.minimum(ground.edges_m, self._missing(ranges_m))
+        edges_m = np.minimum(ground.edges_m, self._missing(ground, ranges_m))
         edges_m[edges_m >= ranges_m] = np.inf
         points_m, tops_m = self._marks(key[obstacle], over[obstacle], self._x[near][obstacle], self._y[near][obstacle])
         at_edge = np.isfinite(edges_m)
@@ -273,6 +273,7 @@ class _Reading:
         lowest = z <= low_z[key]
         low_r = np.zeros(cells, np.float32)
         low_r[key[lowest]] = r[lowest]
+        stands = self._stands(low_z, low_r, r, z, key).reshape(self._shape)
         low_z, low_r = low_z.reshape(self._shape), low_r.reshape(self._shape)
         ground = _Ground(self._shape)
         steepest, rise, fall = (
@@ -295,8 +296,9 @@ class _Reading:
                     edges_m = self._edges_m(at_r, at_z, slope, low_r[number], low_z[number])
                     ground.edges_m[falls] = np.minimum(ground.edges_m, edges_m)[falls]
                     ditch_m = np.where(dips, edges_m, ditch_m)
-                ground.edges_m = np.where(too_steep, np.minimum(ground.edges_m, ditch_m), ground.edges_m)
-                is_ground = there & ~too_steep & ~falls
+                other_side = too_steep | (dips & stands[number])
+                ground.edges_m = np.where(other_side, np.minimum(ground.edges_m, ditch_m), ground.edges_m)
+                is_ground = there & ~too_steep & ~falls & ~stands[number]
                 ditch_m[is_ground & ~dips] = np.inf
                 at_z = np.where(is_ground, low_z[number], at_z)
                 at_r = np.where(is_ground, low_r[number], at_r)
@@ -305,6 +307,22 @@ class _Reading:
                 ground.seen[number] = is_ground
             ground.z_m[number], ground.r_m[number], ground.slope[number] = at_z, at_r, slope
         return ground
+
+    def _stands(
+        self,
+        low_z: NDArray[np.float32],
+        low_r: NDArray[np.float32],
+        r: NDArray[np.float32],
+        z: NDArray[np.float32],
+        key: Indices,
+    ) -> NDArray[np.bool_]:
+        """Bins in which something rises too steeply above the lowest point, which is then its foot and no ground."""
+        up = z - low_z[key]
+        along = np.abs(r - low_r[key]) * np.float32(math.tan(self._options.max_slope_rad))
+        steep = (up > np.maximum(along, self._options.step_m)) & (up <= self._options.max_obstacle_height)
+        found = np.zeros(len(low_z), np.bool_)
+        found[key[steep]] = True
+        return found
 
     def _edges_m(
         self,
@@ -324,26 +342,33 @@ class _Reading:
             edges = np.maximum((at_r + ahead) / 2, ahead - 0.25)
         return np.maximum(edges, self._options.range_min_m).astype(np.float64)
 
-    def _missing(self, ranges_m: Floats) -> Floats:
-        """Where ground is missing, (sectors,): two rings that should meet it meet nothing, and all below them do."""
+    def _missing(self, ground: "_Ground", ranges_m: Floats) -> Floats:
+        """Where ground is missing, (sectors,): two rings that should meet it meet nothing, and all below them do.
+
+        They should meet it where it would be if it went on as it was last seen.
+        """
         options = self._options
         edges_m = np.full(options.sectors, np.inf)
         rings = np.array(sorted(angle for angle in options.ring_elevations_rad if angle < 0))
         if len(rings) < 3:
             return edges_m
-        meets_m = self._height_m / np.tan(-rings)
         elevations = np.arctan2(self._z - self._height_m, self._r)
         ring = np.clip(np.searchsorted((rings[1:] + rings[:-1]) / 2, elevations), 0, len(rings) - 1)
         close = np.abs(elevations - rings[ring]) < np.diff(rings).min() / 2
         there = np.zeros((len(rings), options.sectors), np.bool_)
         there[ring[close], self._sector[close]] = True
+        # A scanner with few bearings leaves some sectors out, by chance other ones in each ring.
+        there |= np.roll(there, 1, axis=1) | np.roll(there, -1, axis=1)
         below = np.logical_and.accumulate(there, axis=0)
+        last_m, z_m, slope = ground.r_m[-1], ground.z_m[-1], ground.slope[-1]
         for number in range(1, len(rings) - 1):
-            if meets_m[number] > options.drop_range_m:
+            if self._height_m / math.tan(-rings[number]) > options.drop_range_m:
                 break
-            gone = below[number - 1] & ~there[number] & ~there[number + 1] & (ranges_m > meets_m[number])
-            edge_m = (meets_m[number - 1] + meets_m[number]) / 2
-            edges_m[gone] = np.minimum(edges_m[gone], edge_m)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                meets_m = (self._height_m - z_m + slope * last_m) / (slope + np.float32(math.tan(-rings[number])))
+            gone = below[number - 1] & ~there[number] & ~there[number + 1]
+            gone &= (last_m < meets_m) & (meets_m <= options.drop_range_m) & (meets_m < ranges_m)
+            edges_m = np.where(gone, np.minimum(edges_m, (last_m + meets_m) / 2), edges_m)
         return edges_m
 
     def _marks(
