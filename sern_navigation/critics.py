@@ -199,13 +199,13 @@ class PathAlignCritic:
         if blocked > 2 and blocked / furthest > self.max_path_occupancy_ratio:
             return None
         x, y = batch.x_m[:: self.trajectory_point_step], batch.y_m[:: self.trajectory_point_step]
-        if len(x) < 2:
-            return None
-        driven = np.cumsum(np.hypot(np.diff(x, axis=0), np.diff(y, axis=0)), axis=0)
+        began = [np.full((1, x.shape[1]), place, np.float32) for place in task.pose[:2]]
+        steps = np.diff(np.concatenate((began[0], x)), axis=0), np.diff(np.concatenate((began[1], y)), axis=0)
+        driven = np.cumsum(np.hypot(*steps), axis=0)
         middles = ((task.along_m[1:] + task.along_m[:-1]) / 2).astype(np.float32)
         nearest = np.searchsorted(middles, driven)
         path = task.path_m.astype(np.float32)
-        away = np.hypot(path[nearest, 0] - x[1:], path[nearest, 1] - y[1:])
+        away = np.hypot(path[nearest, 0] - x, path[nearest, 1] - y)
         counted = task.path_free[nearest]
         sums = np.where(counted, away, 0).sum(axis=0) / np.maximum(counted.sum(axis=0), 1)
         return _weighted(sums.astype(np.float32), self.cost_weight, self.cost_power)

@@ -169,7 +169,7 @@ def test_a_yard_looks_as_it_is() -> None:
 def test_the_scanner_need_not_be_in_the_middle() -> None:
     """0.2 m forward: what it sees 1.8 m ahead is 2 m ahead of the robot."""
     options = ScanOptions(origin_m=(0.2, 0.0, 0.4))
-    points = looking_at(lambda x, y: lifted(x > 1.8, 1.0)) + [0.2, 0.0, 0.0]
+    points = looking_at(lambda x, y: lifted(x > 1.8, 1.0)) + np.array([0.2, 0.0, 0.0])
     scan = used(obstacle_scan(Cloud(points, 0.0), options))
     assert scan.ranges_m[ahead(scan, 0.02)] == pytest.approx(1.8, abs=0.03)
     assert scan.points_m[:, 0].min() == pytest.approx(2.0, abs=0.03)

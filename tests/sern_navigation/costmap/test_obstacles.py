@@ -78,14 +78,14 @@ def test_what_goes_is_cleared_by_what_is_seen_behind_it() -> None:
 
 
 def test_what_is_below_all_rays_stays() -> None:
-    """A log of 16 cm at 2 m is seen; at 0.7 m the lowest ray passes 21 cm above the ground."""
+    """A log of 16 cm at 2 m is seen; at 0.5 m the lowest ray passes 27 cm above the ground."""
     layer = ObstacleLayer(GRID, FAR)
     layer.observe((0.0, 0.0, 0.0), scan_of(thing(2.0, 0.16)))
     assert marked(layer, 2.05, 0.0)
-    nearer = scan_of(thing(0.7, 0.16))
+    nearer = scan_of(thing(0.5, 0.16))
     assert not np.isfinite(nearer.ranges_m[180]), "it is not seen from here"
     for _ in range(5):
-        layer.observe((1.3, 0.0, 0.0), nearer)
+        layer.observe((1.5, 0.0, 0.0), nearer)
     assert marked(layer, 2.05, 0.0)
     layer.observe((-1.0, 0.0, 0.0), scan_of(level))
     assert not marked(layer, 2.05, 0.0), "from further away one sees that it is gone"
