@@ -12,7 +12,7 @@ from sern_navigation.matching import Match, MatchOptions, NoMatch, match
 from sern_navigation.scan import ObstacleScan
 from sern_twin.world.grid import Floats, Grid
 from sern_twin.world.occupancy import Occupancy, OccupancyOptions, Pose
-from sern_twin.world.patches import OCCUPIED, UNKNOWN
+from sern_twin.world.patches import UNKNOWN
 
 
 class Placed(StrEnum):
@@ -51,6 +51,9 @@ class Mapped:
 
 _TOO_LITTLE: Final = frozenset({NoMatch.FEW_POINTS, NoMatch.EMPTY_MAP, NoMatch.LITTLE_OVERLAP})
 
+_OCCUPIED: Final = 65
+"""Per cent: so a cell is occupied for the next scan once one has ended in it. A scene waits for more."""
+
 
 class Mapper:
     """One map, all unknown at first."""
@@ -74,9 +77,8 @@ class Mapper:
 
     def add(self, prediction: Pose, scan: ObstacleScan) -> Mapped:
         """Take a scan of a robot that is thought to be there. Nothing is raised, whatever the numbers are."""
-        classes = self.occupancy.classes()
-        points = ends_m(scan)
-        found = match(self.grid, classes == OCCUPIED, classes != UNKNOWN, prediction, points, self._options.matching)
+        cells = self.occupancy.cells()
+        found = match(self.grid, cells >= _OCCUPIED, cells != UNKNOWN, prediction, ends_m(scan), self._options.matching)
         if isinstance(found, Match):
             mapped = Mapped(found.pose, Placed.MATCHED, found)
         else:
