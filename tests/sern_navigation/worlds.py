@@ -2,17 +2,22 @@
 
 import math
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from random import Random
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sern_navigation.costmap.twin import TwinView
+from sern_navigation.navigator import Command, Navigator, State
 from sern_navigation.scan import VLP16_RAD, Cloud
-from sern_sim.robot import LIDAR_HEIGHT_M, SimulatedJackal
+from sern_sim.robot import BODY_RADIUS_M, LIDAR_HEIGHT_M, STEP_S, SimulatedJackal
 from sern_sim.world import World
 from sern_twin.world.grid import Floats, Grid
 
 Wall = tuple[float, float, float, float, float]
+PERIOD_S: Final = 0.1
 Heights = Callable[[Floats, Floats], Floats]
 
 
@@ -80,3 +85,31 @@ def filled(grid: Grid, *areas: tuple[float, float, float, float]) -> NDArray[np.
         inside &= (places[..., 1] > south_m) & (places[..., 1] < north_m)
         cells[inside] = 100
     return cells
+
+
+def drive(
+    navigator: Navigator,
+    robot: SimulatedJackal,
+    twin: TwinView | None = None,
+    *,
+    seconds: float = 60.0,
+    points: int = 5_760,
+) -> list[Command]:
+    """Until the goal is reached or given up: commands at 10 Hz, divided by what the base is thought to make of a turn.
+
+    AssertionError: the robot's body meets something.
+    """
+    found: list[Command] = []
+    for _ in range(round(seconds / PERIOD_S)):
+        state = robot.state
+        view = None if twin is None else replace(twin, stamp_s=state.time_s)
+        pose = (state.pose.x_m, state.pose.y_m, state.pose.yaw_rad)
+        command = navigator.step(state.time_s, pose, seen(robot, points), view)
+        found.append(command)
+        if command.status.state not in (State.FOLLOWING, State.RECOVERING):
+            break
+        robot.drive(command.speed[0], command.speed[1] / robot.yaw_scale_known)
+        for _ in range(round(PERIOD_S / STEP_S)):
+            here = robot.step().pose
+            assert robot.world.clearance_m(here.x_m, here.y_m) > BODY_RADIUS_M, (here, command)
+    return found
