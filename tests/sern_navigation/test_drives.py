@@ -45,7 +45,7 @@ def test_a_twin_that_knows_of_the_car_shows_the_way_around_it() -> None:
         commands = drive(navigator, robot, view)
         assert commands[-1].status.state is State.SUCCEEDED
         travelled_m.append(robot.state.travelled_m)
-    assert furthest_m[0] < 0.1 and furthest_m[1] > 1.1, "the first plan leads around it"
+    assert furthest_m[0] < 0.3 and furthest_m[1] > 1.1, "the first plan leads around it"
     assert travelled_m[1] < travelled_m[0] + 0.1
 
 
