@@ -60,12 +60,6 @@ class Task:
         return math.dist(self.pose[:2], self.goal[:2])
 
     @cached_property
-    def escapes(self) -> bool:
-        """The robot touches something where it is: only what is lethal stops it then, so that it gets away."""
-        here = int(self.costmap.at(np.array(self.pose[:2])))
-        return here in (INSCRIBED_INFLATED_OBSTACLE, LETHAL_OBSTACLE)
-
-    @cached_property
     def path_free(self) -> Mask:
         """Which points of the path no real obstacle has come to lie on, (points,)."""
         costs = self.costmap.at(self.path_m)
@@ -78,16 +72,18 @@ class Task:
         steps = np.hypot(*np.diff(self.path_m, axis=0).T)
         return np.concatenate(([0.0], np.cumsum(steps)))
 
-    def collides(self, costs: Costs) -> Mask:
-        found: Mask = costs == LETHAL_OBSTACLE
-        return found if self.escapes else found | (costs == INSCRIBED_INFLATED_OBSTACLE)
-
     def furthest(self, batch: Batch) -> int:
         """Of the points of the path that are nearest to the trajectories' ends, the furthest along."""
         x, y, _yaw = batch.last()
         path = self.path_m.astype(np.float32)
         squares = (path[:, 0, None] - x) ** 2 + (path[:, 1, None] - y) ** 2
         return int(squares.argmin(axis=0).max())
+
+
+def collides(costs: Costs) -> Mask:
+    """Where the middle of the robot cannot be. What is unknown is no collision."""
+    found: Mask = (costs == LETHAL_OBSTACLE) | (costs == INSCRIBED_INFLATED_OBSTACLE)
+    return found
 
 
 def look_up(costmap: Costmap, x_m: Singles, y_m: Singles) -> tuple[Costs, Costs]:
@@ -141,7 +137,7 @@ class CostCritic:
     def score(self, batch: Batch, task: Task) -> tuple[Singles, Mask]:
         """The scores, and which trajectories collide."""
         costs, soft = look_up(task.costmap, batch.x_m, batch.y_m)
-        collide: Mask = np.any(task.collides(costs), axis=0)
+        collide: Mask = np.any(collides(costs), axis=0)
         values = np.where(costs >= self.near_collision_cost, np.float32(self.critical_cost), np.float32(0))
         if task.goal_distance_m > self.near_goal_distance:
             plain = np.minimum(costs.astype(np.float32) + soft, np.float32(MAX_NON_OBSTACLE))

@@ -1,7 +1,9 @@
 """The next command by model predictive path integral control (Williams et al., IROS 2016), as nav2_mppi_controller.
 
 Many trajectories around the last best one are drawn and scored; the next is their mean, weighted by exp(-cost/λ). The
-mean of two ways around a thing may go through it: a command is given only where its own trajectory is free.
+mean of two ways around a thing may go through it: a command is given only where its own trajectory is free. A few of
+the trajectories follow the path (Trevisan and Alonso-Mora, Biased-MPPI, 2024): where it is narrow, hardly one of those
+that are drawn at random is free.
 """
 
 import math
@@ -15,7 +17,8 @@ from numpy.typing import NDArray
 
 from sern_core.vocabulary.errors import UsageError
 from sern_navigation.costmap.costs import Costmap
-from sern_navigation.critics import Batch, Critics, Singles, Task, look_up
+from sern_navigation.costmap.escape import escaping
+from sern_navigation.critics import Batch, Critics, Singles, Task, collides, look_up
 from sern_twin.world.grid import Floats
 from sern_twin.world.occupancy import Pose
 
@@ -27,6 +30,12 @@ PATH_STEP_M: Final = 0.05
 _SAVITZKY_GOLAY: Final = np.array([-21, 14, 39, 54, 59, 54, 39, 14, -21], np.float64) / 231
 """Quadratic, nine points (Savitzky and Golay, 1964)."""
 _HISTORY: Final = 4
+_SHARES: Final = np.array([1.0, 0.5, 0.2])
+"""Of the largest speed: so fast some of the trajectories follow the path."""
+_LOOK_AHEAD_M: Final = 0.4
+_THERE_M: Final = 0.05
+_LOOKS_RAD: Final = 0.6
+_TURN: Final = 2 * math.pi
 
 
 class ControlCode(StrEnum):
@@ -64,10 +73,10 @@ class MppiOptions:
     critics: Critics = field(default_factory=Critics)
 
     def __post_init__(self) -> None:
-        if not (2 <= self.batch_size <= 100_000 and 2 <= self.time_steps <= 1_000 and self.iteration_count >= 1):
+        if not (4 <= self.batch_size <= 100_000 and 2 <= self.time_steps <= 1_000 and self.iteration_count >= 1):
             raise UsageError(
                 f"mppi with batch_size {self.batch_size}, time_steps {self.time_steps}, iteration_count "
-                f"{self.iteration_count}: give 2 to 100000, 2 to 1000, and 1 or more"
+                f"{self.iteration_count}: give 4 to 100000, 2 to 1000, and 1 or more"
             )
         for name in (
             "model_dt",
@@ -158,8 +167,11 @@ class Mppi:
         """The best controls (steps, 2); None where all that were drawn collide."""
         options = self.options
         controls = self._within_limits(self._controls, speed)
+        follows = self._following(task)
         for _ in range(options.iteration_count):
             drawn = self._drawn(controls)
+            for axis in (0, 1):
+                drawn[axis][:, : len(_SHARES)] = follows[axis]
             batch = self._rolled_out(task.pose, speed, drawn)
             scores, collide = options.critics.score(batch, task)
             if collide.all():
@@ -177,7 +189,7 @@ class Mppi:
             (0.0, 0.0, yaw_rad),
             pruned(path_m, pose, options.prune_distance) - [x_m, y_m],
             (goal[0] - x_m, goal[1] - y_m, goal[2]),
-            replace(costmap, grid=grid),
+            replace(escaping(costmap, pose), grid=grid),
             options.model_dt,
             options.vx_min,
             options.vx_max,
@@ -185,7 +197,7 @@ class Mppi:
 
     def _meets(self, task: Task, trajectory: Floats) -> bool:
         costs, _soft = look_up(task.costmap, *trajectory[:, :2].T.astype(np.float32))
-        return bool(task.collides(costs).any())
+        return bool(collides(costs).any())
 
     def _drawn(self, controls: Floats) -> tuple[Singles, Singles]:
         """Controls with noise, (steps, batch) of each."""
@@ -197,6 +209,29 @@ class Mppi:
             mean[:, 0, None] + noise[0] * np.float32(options.vx_std),
             mean[:, 1, None] + noise[1] * np.float32(options.wz_std),
         )
+
+    def _following(self, task: Task) -> tuple[Singles, Singles]:
+        """Controls that follow the path by pure pursuit at some speeds, (steps, speeds) of each."""
+        options = self.options
+        x, y, yaw, gone = (np.full(len(_SHARES), value) for value in (*task.pose, 0.0))
+        vx, wz = (np.empty((options.time_steps, len(_SHARES)), np.float32) for _ in range(2))
+        for number in range(options.time_steps):
+            ahead = gone + _LOOK_AHEAD_M
+            to_x = np.interp(ahead, task.along_m, task.path_m[:, 0]) - x
+            to_y = np.interp(ahead, task.along_m, task.path_m[:, 1]) - y
+            off = np.arctan2(to_y, to_x) - yaw
+            off = off - _TURN * np.round(off / _TURN)
+            there = np.hypot(to_x, to_y) < _THERE_M
+            looks = np.abs(off) < _LOOKS_RAD
+            speed = np.where(looks & ~there, options.vx_max * _SHARES, 0.0)
+            # Towards a point on a circle (Coulter, 1992); on the spot where it lies elsewhere.
+            turn = np.where(looks, 2 * speed * np.sin(off) / _LOOK_AHEAD_M, 2 * off)
+            turn = np.where(there, 0.0, np.clip(turn, -options.wz_max, options.wz_max))
+            vx[number], wz[number] = speed, turn
+            heading = yaw + turn * options.model_dt / 2
+            x, y = x + speed * np.cos(heading) * options.model_dt, y + speed * np.sin(heading) * options.model_dt
+            yaw, gone = yaw + turn * options.model_dt, gone + speed * np.cos(off) * options.model_dt
+        return vx, wz
 
     def _rolled_out(self, pose: Pose, speed: Speed, drawn: tuple[Singles, Singles]) -> Batch:
         """Where controls lead a robot with differential drive, whose speeds change no faster than they can."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from sern_core.vocabulary.errors import UsageError
 from sern_navigation.costmap.costs import INSCRIBED_INFLATED_OBSTACLE, LETHAL_OBSTACLE, Costmap
+from sern_navigation.costmap.escape import escaping
 from sern_twin.world.occupancy import Pose
 
 Speed = tuple[float, float]
@@ -128,9 +129,7 @@ class Recovery:
             return Progress.FAILED, _STILL
         ahead_m = min(options.backup_speed * options.simulate_ahead_time, left_m)
         places = np.linspace(0.0, -ahead_m, 2 + math.ceil(ahead_m / costmap.grid.cell_m))[1:, None]
-        costs = costmap.at(places * [math.cos(pose[2]), math.sin(pose[2])] + pose[:2])
-        # A robot that touches something already may get away from it.
-        touches = costmap.at(np.array(pose[:2])) == INSCRIBED_INFLATED_OBSTACLE
-        if (costs == LETHAL_OBSTACLE).any() or (not touches and (costs == INSCRIBED_INFLATED_OBSTACLE).any()):
+        costs = escaping(costmap, pose).at(places * [math.cos(pose[2]), math.sin(pose[2])] + pose[:2])
+        if ((costs == LETHAL_OBSTACLE) | (costs == INSCRIBED_INFLATED_OBSTACLE)).any():
             return Progress.FAILED, _STILL
         return Progress.RUNNING, (-options.backup_speed, 0.0)

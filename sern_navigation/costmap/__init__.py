@@ -5,5 +5,6 @@ inflation  costs around obstacles
 static     the map
 obstacles  what real scans mark and clear
 twin       what the twin says, as costs alone
+escape     costs for a robot that touches something
 layered    the layers together
 """

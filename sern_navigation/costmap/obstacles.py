@@ -16,6 +16,8 @@ from sern_navigation.scan import ObstacleScan
 from sern_twin.world.grid import NOWHERE, Floats, Grid
 from sern_twin.world.occupancy import Pose
 
+_NEAR_M: Final = 1.5
+"""Where the lowest ray of the simulated robot's scanner meets level ground."""
 _CLEARLY_M: Final = 0.02
 """So much lower than a mark's top a ray must pass: both tremble."""
 
@@ -57,6 +59,8 @@ class ObstacleLayer:
         self._marked = np.zeros(grid.shape, np.bool_)
         self._free = np.zeros(grid.shape, np.bool_)
         self._tops_m = np.zeros(grid.shape, np.float32)
+        self._hidden = np.zeros(grid.shape, np.bool_)
+        """Near the robot, and so low that no ray of the last scan would have met it."""
 
     @property
     def lethal(self) -> Mask:
@@ -98,8 +102,11 @@ class ObstacleLayer:
         return found
 
     def clear(self) -> None:
-        """Forget all: what Nav2 calls clearing the entire costmap."""
-        self._marked[:] = False
+        """Forget all that the next scan would show: Nav2's clearing of the costmap, but for what is near and below
+        all rays. Nothing would show that again, such as the edge of a ditch that the robot stands before.
+        """
+        kept = self._marked & self._hidden
+        self._marked[:] = kept
         self._free[:] = False
 
     def _offsets(self, window: Window, x_m: float, y_m: float) -> tuple[Floats, Floats]:
@@ -128,7 +135,10 @@ class ObstacleLayer:
             np.float32(np.inf),
         )
         marked, free = self._marked[window.slices], self._free[window.slices]
-        marked &= ~(passed <= self._tops_m[window.slices] - np.float32(_CLEARLY_M))
+        met = passed <= self._tops_m[window.slices] - np.float32(_CLEARLY_M)
+        marked &= ~met
+        self._hidden[:] = False
+        self._hidden[window.slices] = ~met & (ranges <= _NEAR_M)
         free |= passed <= options.seen_below_m
         free &= ~marked
 

@@ -96,17 +96,6 @@ def test_near_the_goal_only_what_is_near_costs() -> None:
     assert scores[0] == 0
 
 
-def test_a_robot_that_touches_something_is_stopped_by_what_is_lethal_alone() -> None:
-    costs = np.zeros(GRID.shape, np.uint8)
-    costs[45:56, 45:56] = 253
-    touching = Costmap(GRID, costs, np.zeros(GRID.shape, np.uint8))
-    _scores, collide = CostCritic().score(driven((0.5, 0.0)), Task((0, 0, 0), PATH, (4, 0, None), touching, DT, -1, 1))
-    assert not collide.any()
-    away = Task((-1.0, 0.0, 0.0), PATH, (4, 0, None), touching, DT, -1, 1)
-    _scores, collide = CostCritic().score(driven((0.5, 0.0)), away)
-    assert collide.all()
-
-
 def test_near_the_goal_one_drives_to_it() -> None:
     batch = driven((0.5, 0.0), (0.2, 0.0))
     assert GoalCritic().score(batch, task()) is None, "it is far"

@@ -187,7 +187,7 @@ def test_slower_periods_than_the_model_are_refused_and_faster_ones_are_not() -> 
 @pytest.mark.parametrize(
     "change",
     [
-        {"batch_size": 1}, {"time_steps": 1}, {"iteration_count": 0}, {"model_dt": 0.0}, {"temperature": math.nan},
+        {"batch_size": 3}, {"time_steps": 1}, {"iteration_count": 0}, {"model_dt": 0.0}, {"temperature": math.nan},
         {"vx_max": -1.0}, {"vx_min": 0.1}, {"ax_min": 0.0}, {"az_max": 0.0}, {"gamma": -1.0}, {"prune_distance": 0.0},
         {"retry_attempt_limit": -1}, {"wz_std": math.inf},
     ],
