@@ -4,7 +4,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 TEST_PROCESSES ?= 3
 RANDOM_TESTS = $(shell grep -rlE '^(from|import) (hypothesis|tests\.exploring)' tests --include='test_*.py' | grep -v tests/peers)
-PACKAGES := sern_core sern_runtime sern_relay sern_client sern_sim sern_twin sern_perception sern_tools benchmarks tests
+PACKAGES := sern_core sern_runtime sern_relay sern_client sern_sim sern_twin sern_navigation sern_perception sern_tools benchmarks tests
 
 # What a process compiles it keeps (__pycache__) for the next one, whatever the environment says: a daemon starts with a
 # quarter less of CPU, and each worker of the tests would rewrite all of them anew.

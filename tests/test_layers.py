@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-PURE_PACKAGES = ("sern_core", "sern_sim", "sern_twin")
+PURE_PACKAGES = ("sern_core", "sern_sim", "sern_twin", "sern_navigation")
 # `random` may be imported for its type (a seeded Random is handed in), never for the module's own functions.
 RANDOM_ALLOWED = {"Random"}
 OWN_CLOCK = {"loop.py", "logs.py"}  # how long the loop was held, how often a line was written: nothing of the core

@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Final
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("sern_core", "sern_sim", "sern_runtime", "sern_relay", "sern_client", "sern_twin", "sern_tools")
+PACKAGES = (
+    "sern_core", "sern_sim", "sern_runtime", "sern_relay", "sern_client", "sern_twin", "sern_navigation", "sern_tools",
+)  # fmt: skip
 
 PUBLIC: Final = frozenset({"_asdict", "_fields", "_make", "_replace"})
 """The documented methods of named tuples, whose names only keep out of the way of the fields."""

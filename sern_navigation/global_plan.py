@@ -1,0 +1,227 @@
+"""The cheapest way over a costmap: A* on the eight neighbours of each cell, with the costs of Nav2's SmacPlanner2D.
+
+The search is scipy's Dijkstra on edges from which the heuristic is taken off, so that it expands what A* would, up to a
+bound that grows until the goal is within it. The heuristic is the shortest way without any cost, so ways are optimal.
+"""
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from sern_core.vocabulary.errors import UsageError
+from sern_navigation.costmap.costs import LETHAL_OBSTACLE, MAX_NON_OBSTACLE, NO_INFORMATION, Costmap, Mask
+from sern_twin.world.grid import NOWHERE, Floats, Indices
+
+Point = tuple[float, float]
+
+_STEPS: Final = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
+_SQRT2: Final = math.sqrt(2)
+_LEAST: Final = 1e-9
+"""An edge of a graph weighs something, or it is none."""
+_FIRST_SLACK: Final = 0.05
+_MORE_SLACK: Final = 4.0
+_SMOOTHINGS: Final = 20
+
+
+class PlanCode(StrEnum):
+    """Why there is a plan, or none; the names are those of nav2_msgs/action/ComputePathToPose."""
+
+    NONE = "none"
+    """No error."""
+    START_OUTSIDE_MAP = "start_outside_map"
+    GOAL_OUTSIDE_MAP = "goal_outside_map"
+    START_OCCUPIED = "start_occupied"
+    GOAL_OCCUPIED = "goal_occupied"
+    NO_VALID_PATH = "no_valid_path"
+
+
+@dataclass(frozen=True, slots=True)
+class PlannerOptions:
+    """UsageError: a number that is negative or not finite."""
+
+    tolerance: float = 0.25
+    """[m]: how far from the goal a way may end that does not reach it."""
+    allow_unknown: bool = True
+    cost_travel_multiplier: float = 2.0
+    """A cell's length counts 1 + so much of its cost, of 252."""
+    start_tolerance: float = 0.35
+    """[m]: how far away a robot that touches an obstacle may begin its way. Nav2 has none: such a start is occupied."""
+
+    def __post_init__(self) -> None:
+        for name in ("tolerance", "cost_travel_multiplier", "start_tolerance"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0):
+                raise UsageError(f"a planner with {name} {value}: give a number of 0 or more")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plan:
+    """`code` NONE: `path_m` (n, 2) from the start on, and its `cost` in cells' lengths. Else `message` says why."""
+
+    code: PlanCode
+    message: str
+    path_m: Floats
+    cost: float = math.inf
+
+    @property
+    def found(self) -> bool:
+        return self.code is PlanCode.NONE
+
+    @property
+    def length_m(self) -> float:
+        return float(np.hypot(*np.diff(self.path_m, axis=0).T).sum())
+
+
+def plan(costmap: Costmap, start_m: Point, goal_m: Point, options: PlannerOptions) -> Plan:
+    """The way from start to goal. Nothing is raised: whatever the numbers are, there is a code."""
+    grid = costmap.grid
+    start, goal = int(grid.flat(np.array(start_m))), int(grid.flat(np.array(goal_m)))
+    if start == NOWHERE:
+        return _none(PlanCode.START_OUTSIDE_MAP, f"the start {_said(start_m)} is not on the map: drive back onto it")
+    if goal == NOWHERE:
+        return _none(PlanCode.GOAL_OUTSIDE_MAP, f"the goal {_said(goal_m)} is not on the map: give one that is")
+    free = ~costmap.blocked()
+    if not options.allow_unknown:
+        free &= costmap.costs != NO_INFORMATION
+    begin = start
+    if not free.reshape(-1)[start]:
+        lethal = costmap.costs.reshape(-1)[start] == LETHAL_OBSTACLE
+        found = None if lethal else _nearest(costmap, free, start_m, options.start_tolerance)
+        if found is None:
+            return _none(PlanCode.START_OCCUPIED, f"the start {_said(start_m)} is in an obstacle: move the robot")
+        begin = found
+    ends = _within(costmap, goal_m, options.tolerance)
+    ends = ends[free.reshape(-1)[ends]]
+    if not free.reshape(-1)[goal] and not len(ends):
+        return _none(
+            PlanCode.GOAL_OCCUPIED,
+            f"the goal {_said(goal_m)} is in an obstacle, as is all within {options.tolerance:g} m: give another",
+        )
+    search = _Search(costmap, free, begin, goal, options)
+    if search.cost(goal) == math.inf:
+        reached = [end for end in ends.tolist() if search.cost(end) < math.inf]
+        if not reached:
+            return _none(
+                PlanCode.NO_VALID_PATH,
+                f"no way leads from {_said(start_m)} to {_said(goal_m)}: something closes it off",
+            )
+        goal = reached[0]
+    cells = search.way(goal)
+    path = grid.centres(*np.divmod(cells, grid.columns))
+    if begin != start:
+        path = np.concatenate(([start_m], path))
+    path[0] = start_m
+    if goal == int(grid.flat(np.array(goal_m))):
+        path[-1] = goal_m
+    return Plan(PlanCode.NONE, "", _smooth(path, costmap, free), search.cost(goal))
+
+
+def _none(code: PlanCode, message: str) -> Plan:
+    return Plan(code, message, np.empty((0, 2)))
+
+
+def _said(point: Point) -> str:
+    return f"({point[0]:.2f}, {point[1]:.2f})"
+
+
+def _within(costmap: Costmap, place_m: Point, radius_m: float) -> Indices:
+    """The cells whose middles are so near to a place, the nearest first."""
+    grid = costmap.grid
+    reach = math.ceil(radius_m / grid.cell_m) + 1
+    row, column = (int(number) for number in grid.index(np.array(place_m)))
+    rows = np.arange(max(row - reach, 0), min(row + reach + 1, grid.rows))
+    columns = np.arange(max(column - reach, 0), min(column + reach + 1, grid.columns))
+    away = np.hypot(*np.moveaxis(grid.centres(rows[:, None], columns) - place_m, -1, 0)).reshape(-1)
+    numbers = (rows[:, None] * grid.columns + columns).reshape(-1)
+    order = np.argsort(away, kind="stable")
+    found: Indices = numbers[order[away[order] <= radius_m]]
+    return found
+
+
+def _nearest(costmap: Costmap, free: Mask, place_m: Point, radius_m: float) -> int | None:
+    cells = _within(costmap, place_m, radius_m)
+    cells = cells[free.reshape(-1)[cells]]
+    return int(cells[0]) if len(cells) else None
+
+
+class _Search:
+    """From one cell, by A* to the goal; to all cells if that is not reached."""
+
+    def __init__(self, costmap: Costmap, free: Mask, begin: int, goal: int, options: PlannerOptions) -> None:
+        grid = costmap.grid
+        factors = 1 + options.cost_travel_multiplier * costmap.weights() / MAX_NON_OBSTACLE
+        rows, columns = np.divmod(np.arange(grid.rows * grid.columns), grid.columns)
+        goal_row, goal_column = divmod(goal, grid.columns)
+        across, along = np.abs(columns - goal_column), np.abs(rows - goal_row)
+        self._left = np.maximum(across, along) + (_SQRT2 - 1) * np.minimum(across, along)
+        self._begin = begin
+        graph = _edges(free, factors, self._left.reshape(grid.shape))
+        slack = max(_FIRST_SLACK * float(self._left[begin]), 1.0)
+        most = float(self._left[begin]) * float(factors[free].max(initial=1.0)) + len(rows)
+        self._reduced, self._before = self._run(graph, slack)
+        while not math.isfinite(self._reduced[goal]) and slack < math.inf:
+            slack = slack * _MORE_SLACK if slack < most else math.inf
+            self._reduced, self._before = self._run(graph, slack)
+
+    def _run(self, graph: csr_matrix, limit: float) -> tuple[Floats, NDArray[np.int32]]:
+        found, before = dijkstra(graph, indices=self._begin, return_predecessors=True, limit=limit)
+        return found, before
+
+    def cost(self, cell: int) -> float:
+        """What the way to a cell costs, in cells' lengths; inf where none was found."""
+        return float(self._reduced[cell] + self._left[self._begin] - self._left[cell])
+
+    def way(self, cell: int) -> Indices:
+        """The cells from the first to this one."""
+        found = [cell]
+        while found[-1] != self._begin:
+            found.append(int(self._before[found[-1]]))
+        return np.array(found[::-1], np.int64)
+
+
+def _edges(free: Mask, factors: Floats, left: Floats) -> csr_matrix:
+    """What each step between free cells costs, less what it comes nearer to the goal: never below 0.
+
+    It is laid out as the graph's rows are, eight places a cell, of which those that lead nowhere are left out.
+    """
+    rows, columns = free.shape
+    costs = np.full((rows + 2, columns + 2), np.inf, np.float32)
+    costs[1:-1, 1:-1] = np.where(free, factors, np.inf)
+    ahead = np.zeros((rows + 2, columns + 2))
+    ahead[1:-1, 1:-1] = left
+    weights = np.empty((rows, columns, len(_STEPS)), np.float32)
+    numbers = np.empty((rows, columns, len(_STEPS)), np.int32)
+    here = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
+    for place, (up, right) in enumerate(_STEPS):
+        there = (slice(1 + up, rows + 1 + up), slice(1 + right, columns + 1 + right))
+        length = _SQRT2 if up and right else 1.0
+        weights[..., place] = length * costs[there] + (ahead[there] - left)
+        numbers[..., place] = here + (up * columns + right)
+    kept = np.isfinite(weights) & free[..., None]
+    pointers = np.zeros(rows * columns + 1, np.int32)
+    np.cumsum(kept.sum(axis=-1).reshape(-1), out=pointers[1:])
+    kept_weights = np.maximum(weights[kept], _LEAST)
+    return csr_matrix((kept_weights.astype(np.float64), numbers[kept], pointers), shape=(rows * columns,) * 2)
+
+
+def _smooth(path: Floats, costmap: Costmap, free: Mask) -> Floats:
+    """A path without the corners of its cells: each point goes towards its neighbours, if no dearer cell is there.
+
+    Like nav2_smac_planner's smoother (w_smooth 0.3, w_data 0.2), but nothing moves where it costs more.
+    """
+    if len(path) < 3:
+        return path
+    grid, weights = costmap.grid, np.where(free, costmap.weights(), np.inf).reshape(-1)
+    smooth, before = path.copy(), weights[grid.flat(path)]
+    for _ in range(_SMOOTHINGS):
+        middle = smooth[1:-1]
+        moved = middle + 0.2 * (path[1:-1] - middle) + 0.3 * (smooth[2:] + smooth[:-2] - 2 * middle)
+        allowed = weights[grid.flat(moved)] <= before[1:-1]
+        smooth[1:-1] = np.where(allowed[:, None], moved, middle)
+    return smooth

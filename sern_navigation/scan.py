@@ -1,0 +1,409 @@
+"""The obstacle scan of a cloud: what stands in the way at each bearing, and where the ground ends.
+
+The paper's S_2D(r, θ) = min_z L_3D(r, θ, z) collapses the height of a cloud. Here the ground is taken out first, by
+bearing: from the robot outwards a point is ground where the way to it from the ground before is not too steep
+(Himmelsbach et al., IV 2010, with a walk in place of fitted lines), so that hills are no obstacles and low things are.
+Ground that drops away, or that no ray meets where one should, is an obstacle too: its edge is.
+
+A ray shows only what it passes: a log of 20 cm that is below all rays is not gone. So a scan also says how low the
+lowest ray passed, for each bearing and distance.
+"""
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sern_core.vocabulary.errors import UsageError
+from sern_twin.world.grid import Floats
+
+Indices = NDArray[np.intp]
+
+MOST_POINTS: Final = 1_000_000
+VLP16_RAD: Final = tuple(math.radians(degrees) for degrees in range(-15, 16, 2))
+"""Elevations of the 16 rings that Velodyne's VLP-16 and the simulated robot have."""
+_FINE_M: Final = 0.05
+_TURN: Final = 2 * math.pi
+
+
+class Unusable(StrEnum):
+    """Why a cloud makes no scan."""
+
+    FIELDS = "fields"
+    """It has names for its columns, and x, y or z is none of them."""
+    SHAPE = "shape"
+    EMPTY = "empty"
+    NOT_FINITE = "not_finite"
+    """No point of it has three finite numbers, or its time is none."""
+    TOO_LARGE = "too_large"
+    OTHER_FRAME = "other_frame"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cloud:
+    """Points of one turn of a scanner in the robot's own frame: x forward, y left, z up from the ground below it [m].
+
+    `points_m` is (n, 3) or wider, or an array with fields x, y and z. Missing returns are NaN.
+    """
+
+    points_m: NDArray[Any]
+    stamp_s: float
+    frame_id: str = "base_link"
+
+
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """A cloud that makes no scan, and a line for people."""
+
+    reason: Unusable
+    message: str
+
+
+@dataclass(frozen=True, slots=True)
+class ScanOptions:
+    """UsageError: numbers that do not fit together."""
+
+    frame_id: str = "base_link"
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.4)
+    """Where the scanner is in that frame."""
+    sectors: int = 360
+    range_min_m: float = 0.35
+    """What is nearer is the robot itself."""
+    range_max_m: float = 10.0
+    min_obstacle_height: float = 0.10
+    max_obstacle_height: float = 2.0
+    """[m] above the ground, where Nav2 has them above the frame's zero."""
+    max_slope_rad: float = 0.35
+    max_rise_rad: float = 0.26
+    """How much steeper than the ground before it ground may be."""
+    max_fall_rad: float = 0.13
+    """The same downwards, up to `drop_range_m`: behind an edge the next ray meets ground far away, little lower. Ground
+    that falls half as much and then rises steeply is a ditch."""
+    step_m: float = 0.06
+    """A step up that is driven over, and half as much more downwards."""
+    drop_range_m: float = 4.0
+    ring_elevations_rad: tuple[float, ...] = VLP16_RAD
+    """Rings that meet the ground within `drop_range_m` must be there. None: missing ground is not looked for."""
+
+    def __post_init__(self) -> None:
+        if not 8 <= self.sectors <= 3600:
+            raise UsageError(f"a scan of {self.sectors} sectors: give 8 to 3600")
+        if not (0 <= self.range_min_m < self.range_max_m <= 100 and self.origin_m[2] > 0):
+            raise UsageError(
+                f"a scan from {self.range_min_m} m to {self.range_max_m} m, {self.origin_m[2]} m above the ground: "
+                "0 <= range_min_m < range_max_m <= 100, and above 0"
+            )
+        if not 0 < self.step_m <= self.min_obstacle_height < self.max_obstacle_height:
+            raise UsageError(
+                f"obstacles from {self.min_obstacle_height} m to {self.max_obstacle_height} m, steps of {self.step_m} m"
+                ": 0 < step_m <= min_obstacle_height < max_obstacle_height"
+            )
+        if not all(0 < angle < 1.5 for angle in (self.max_slope_rad, self.max_rise_rad, self.max_fall_rad)):
+            raise UsageError("max_slope_rad, max_rise_rad and max_fall_rad lie between 0 and 1.5")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObstacleScan:
+    """What a scan says of its surroundings, in bearings from the scanner, counter-clockwise from -π.
+
+    `ranges_m` (sectors,): S_2D, the nearest obstacle or edge; inf where none is. `drops` (sectors,): it is an edge.
+    `ground_m` (sectors,): how far ground was seen; 0 where nothing was. `points_m` (n, 2): all obstacles and edges in
+    the robot's frame; `tops_m` (n,): how high above the ground they reach. `lowest_m` (bins, sectors): how low the
+    lowest ray passed above the ground; inf where none did. `bins_m` (bins + 1,): the edges of the bins.
+    """
+
+    stamp_s: float
+    origin_m: tuple[float, float]
+    ranges_m: Floats
+    drops: NDArray[np.bool_]
+    ground_m: Floats
+    points_m: Floats
+    tops_m: Floats
+    lowest_m: NDArray[np.float32]
+    bins_m: Floats
+
+    @property
+    def bearings_rad(self) -> Floats:
+        """(sectors,): the middles of the sectors."""
+        return middles(len(self.ranges_m))
+
+
+def middles(sectors: int) -> Floats:
+    """The bearings of the middles of so many sectors, from -π on."""
+    found: Floats = (np.arange(sectors, dtype=np.float64) + 0.5) * (_TURN / sectors) - math.pi
+    return found
+
+
+def bin_edges_m(range_max_m: float) -> Floats:
+    """The edges of the bins of distance: a tenth of a metre wide, two from 2.5 m on, four from 5 m on."""
+    edges = [*(0.1 * number for number in range(25)), *(2.5 + 0.2 * number for number in range(12)), 4.9]
+    while edges[-1] < range_max_m:
+        edges.append(edges[-1] + 0.4)
+    kept = [edge for edge in edges if edge < range_max_m]
+    return np.array([*kept, range_max_m])
+
+
+def obstacle_scan(cloud: Cloud, options: ScanOptions) -> ObstacleScan | Refused:
+    """The scan of a cloud, or why it makes none. Whatever the cloud is, nothing is raised."""
+    if cloud.frame_id != options.frame_id:
+        return Refused(
+            Unusable.OTHER_FRAME,
+            f"a cloud in frame {cloud.frame_id!r}: transform it to {options.frame_id!r} first",
+        )
+    points = _columns(cloud.points_m)
+    if isinstance(points, Refused):
+        return points
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.any() or not math.isfinite(cloud.stamp_s):
+        return Refused(Unusable.NOT_FINITE, f"a cloud of {len(points)} points, none of them finite, or without a time")
+    return _Reading(points[finite] - np.array(options.origin_m, np.float32), options).scan(cloud.stamp_s)
+
+
+def planar_scan(
+    ranges_m: ArrayLike, angles_rad: ArrayLike, stamp_s: float, options: ScanOptions
+) -> ObstacleScan | Refused:
+    """The same of a planar scanner, whose ranges are as in sensor_msgs/LaserScan: inf where nothing is.
+
+    It is believed to see whatever is in the way, as Nav2 does; NaN, and what is too near or far, says nothing.
+    """
+    ranges, angles = np.asarray(ranges_m, np.float64), np.asarray(angles_rad, np.float64)
+    if ranges.ndim != 1 or ranges.shape != angles.shape or len(ranges) > MOST_POINTS:
+        return Refused(Unusable.SHAPE, f"a scan of {ranges.shape} ranges, {angles.shape} angles: give as many of each")
+    if not len(ranges):
+        return Refused(Unusable.EMPTY, "a scan without ranges")
+    used = np.isfinite(angles) & (ranges >= options.range_min_m)
+    if not used.any() or not math.isfinite(stamp_s):
+        return Refused(Unusable.NOT_FINITE, f"a scan of {len(ranges)} ranges of which none says anything")
+    ranges, angles = ranges[used], angles[used]
+    sectors = _sectors(angles, options.sectors)
+    nearest = np.full(options.sectors, np.inf)
+    np.minimum.at(nearest, sectors, np.where(ranges <= options.range_max_m, ranges, np.inf))
+    seen_m = np.zeros(options.sectors)
+    np.maximum.at(seen_m, sectors, np.minimum(ranges, options.range_max_m))
+    seen_m = np.minimum(seen_m, nearest)
+    bins_m = bin_edges_m(options.range_max_m)
+    lowest = np.where(bins_m[1:, None] <= seen_m, 0.0, np.inf).astype(np.float32)
+    ends = ranges <= options.range_max_m
+    directions = np.stack((np.cos(angles[ends]), np.sin(angles[ends])), axis=1)
+    points = ranges[ends, None] * directions + options.origin_m[:2]
+    tops = np.full(len(points), options.origin_m[2])
+    no_drops = np.zeros(options.sectors, np.bool_)
+    return ObstacleScan(stamp_s, options.origin_m[:2], nearest, no_drops, seen_m, points, tops, lowest, bins_m)
+
+
+def _columns(points: NDArray[Any]) -> NDArray[np.float32] | Refused:
+    if points.dtype.names is not None:
+        missing = [name for name in ("x", "y", "z") if name not in points.dtype.names]
+        if missing:
+            return Refused(Unusable.FIELDS, f"a cloud without the field {missing[0]}: it has {points.dtype.names}")
+        points = np.stack([points[name].reshape(-1) for name in ("x", "y", "z")], axis=1)
+    if points.dtype.kind not in "fiu" or points.ndim != 2 or points.shape[1] < 3:
+        return Refused(Unusable.SHAPE, f"a cloud of {points.shape} {points.dtype}: give rows of x, y, z")
+    if not len(points):
+        return Refused(Unusable.EMPTY, "a cloud without points")
+    if len(points) > MOST_POINTS:
+        return Refused(Unusable.TOO_LARGE, f"a cloud of {len(points)} points: {MOST_POINTS} are the most")
+    with np.errstate(over="ignore"):  # beyond float32 is infinite, and that is not finite
+        return points[:, :3].astype(np.float32)
+
+
+def _sectors(bearings_rad: NDArray[np.floating[Any]], sectors: int) -> Indices:
+    found: Indices = np.floor((bearings_rad + math.pi) * (sectors / _TURN)).astype(np.intp) % sectors
+    return found
+
+
+class _Reading:
+    """One cloud, (n, 3) from the scanner on: its walks outwards, all bearings at once."""
+
+    def __init__(self, points: NDArray[np.float32], options: ScanOptions) -> None:
+        self._options = options
+        self._height_m = options.origin_m[2]
+        self._bins_m = bin_edges_m(options.range_max_m)
+        self._shape = len(self._bins_m) - 1, options.sectors
+        with np.errstate(over="ignore"):
+            ranges = np.sqrt(points[:, 0] * points[:, 0] + points[:, 1] * points[:, 1])
+        used = (ranges >= options.range_min_m) & (ranges <= 1e4)
+        points, self._r = points[used], ranges[used]
+        self._x, self._y, self._z = points[:, 0], points[:, 1], points[:, 2] + np.float32(self._height_m)
+        self._sector = _sectors(np.arctan2(self._y, self._x), options.sectors)
+        fine = np.arange(math.ceil(options.range_max_m / _FINE_M) + 1) * _FINE_M + 1e-6
+        table = np.searchsorted(self._bins_m[1:-1], fine, side="right")
+        near = self._r < options.range_max_m
+        self._bin = table[np.where(near, self._r / np.float32(_FINE_M), 0).astype(np.intp)]
+        self._near = near
+
+    def scan(self, stamp_s: float) -> ObstacleScan:
+        options, near = self._options, self._near
+        r, z, sector = self._r[near], self._z[near], self._sector[near]
+        key = self._bin[near] * options.sectors + sector
+        ground = self._walk(r, z, key)
+        over = z - (ground.z_m.reshape(-1)[key] + ground.slope.reshape(-1)[key] * (r - ground.r_m.reshape(-1)[key]))
+        obstacle = (over >= options.min_obstacle_height) & (over <= options.max_obstacle_height)
+        ranges_m = np.full(options.sectors, np.inf)
+        np.minimum.at(ranges_m, sector[obstacle], r[obstacle].astype(np.float64))
+        edges_m = np.minimum(ground.edges_m, self._missing(ground, ranges_m))
+        edges_m[edges_m >= ranges_m] = np.inf
+        points_m, tops_m = self._marks(key[obstacle], over[obstacle], self._x[near][obstacle], self._y[near][obstacle])
+        at_edge = np.isfinite(edges_m)
+        bearings = middles(options.sectors)[at_edge]
+        edge_points = edges_m[at_edge, None] * np.stack((np.cos(bearings), np.sin(bearings)), axis=1)
+        points_m = np.concatenate((points_m, edge_points)) + options.origin_m[:2]
+        tops_m = np.concatenate((tops_m, np.full(len(edge_points), options.min_obstacle_height)))
+        seen = np.where(ground.seen, self._bins_m[1:, None], 0.0).max(axis=0)
+        return ObstacleScan(
+            stamp_s,
+            options.origin_m[:2],
+            np.minimum(ranges_m, edges_m),
+            at_edge,
+            seen,
+            points_m,
+            tops_m,
+            self._lowest(ground),
+            self._bins_m,
+        )
+
+    def _walk(self, r: NDArray[np.float32], z: NDArray[np.float32], key: Indices) -> "_Ground":
+        """From the robot outwards by the lowest point of each bin: ground, or too steep for it, or an edge before."""
+        options, cells = self._options, self._shape[0] * self._shape[1]
+        low_z = np.full(cells, np.inf, np.float32)
+        np.minimum.at(low_z, key, z)
+        lowest = z <= low_z[key]
+        low_r = np.zeros(cells, np.float32)
+        low_r[key[lowest]] = r[lowest]
+        stands = self._stands(low_z, low_r, r, z, key).reshape(self._shape)
+        low_z, low_r = low_z.reshape(self._shape), low_r.reshape(self._shape)
+        ground = _Ground(self._shape)
+        steepest, rise, fall = (
+            np.float32(math.tan(angle)) for angle in (options.max_slope_rad, options.max_rise_rad, options.max_fall_rad)
+        )
+        at_r, at_z, slope = (np.zeros(options.sectors, np.float32) for _ in range(3))
+        ditch_m = np.full(options.sectors, np.inf)  # the edge of one, if what comes next is its other side
+        for number in range(self._shape[0]):
+            there = np.isfinite(low_z[number])
+            if there.any():
+                along = np.maximum(low_r[number] - at_r, np.float32(1e-3))
+                up = np.where(there, low_z[number] - at_z, 0)
+                tilt = up / along
+                bend = tilt - slope
+                too_steep = (up > options.step_m) & ((tilt > steepest) | (bend > rise))
+                sunk = bend * along < -1.5 * options.step_m
+                falls = sunk & ((tilt < -steepest) | ((bend < -fall) & (at_r <= options.drop_range_m)))
+                dips = sunk & (bend < -fall / 2) & (at_r <= options.drop_range_m)
+                if dips.any() or falls.any():
+                    edges_m = self._edges_m(at_r, at_z, slope, low_r[number], low_z[number])
+                    ground.edges_m[falls] = np.minimum(ground.edges_m, edges_m)[falls]
+                    ditch_m = np.where(dips, edges_m, ditch_m)
+                other_side = too_steep | (dips & stands[number])
+                ground.edges_m = np.where(other_side, np.minimum(ground.edges_m, ditch_m), ground.edges_m)
+                is_ground = there & ~too_steep & ~falls & ~stands[number]
+                ditch_m[is_ground & ~dips] = np.inf
+                at_z = np.where(is_ground, low_z[number], at_z)
+                at_r = np.where(is_ground, low_r[number], at_r)
+                # Two points close to each other say little of a slope.
+                slope = np.where(is_ground, np.clip(tilt, -steepest, steepest) * np.minimum(along / 0.3, 1), slope)
+                ground.seen[number] = is_ground
+            ground.z_m[number], ground.r_m[number], ground.slope[number] = at_z, at_r, slope
+        return ground
+
+    def _stands(
+        self,
+        low_z: NDArray[np.float32],
+        low_r: NDArray[np.float32],
+        r: NDArray[np.float32],
+        z: NDArray[np.float32],
+        key: Indices,
+    ) -> NDArray[np.bool_]:
+        """Bins in which something rises too steeply above the lowest point, which is then its foot and no ground."""
+        up = z - low_z[key]
+        along = np.abs(r - low_r[key]) * np.float32(math.tan(self._options.max_slope_rad))
+        steep = (up > np.maximum(along, self._options.step_m)) & (up <= self._options.max_obstacle_height)
+        found = np.zeros(len(low_z), np.bool_)
+        found[key[steep]] = True
+        return found
+
+    def _edges_m(
+        self,
+        at_r: NDArray[np.float32],
+        at_z: NDArray[np.float32],
+        slope: NDArray[np.float32],
+        low_r: NDArray[np.float32],
+        low_z: NDArray[np.float32],
+    ) -> Floats:
+        """Where the ground ends that goes on from a place with a slope, if a ray that passes it ends lower.
+
+        The edge lies between the last ground and where the ray goes below it; the middle is the least off.
+        """
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ray = (self._height_m - low_z) / low_r
+            ahead = (self._height_m - at_z + slope * at_r) / (slope + ray)
+            edges = np.maximum((at_r + ahead) / 2, ahead - 0.25)
+        return np.maximum(edges, self._options.range_min_m).astype(np.float64)
+
+    def _missing(self, ground: "_Ground", ranges_m: Floats) -> Floats:
+        """Where ground is missing, (sectors,): two rings that should meet it meet nothing, and all below them do.
+
+        They should meet it where it would be if it went on as it was last seen.
+        """
+        options = self._options
+        edges_m = np.full(options.sectors, np.inf)
+        rings = np.array(sorted(angle for angle in options.ring_elevations_rad if angle < 0))
+        if len(rings) < 3:
+            return edges_m
+        elevations = np.arctan2(self._z - self._height_m, self._r)
+        ring = np.clip(np.searchsorted((rings[1:] + rings[:-1]) / 2, elevations), 0, len(rings) - 1)
+        close = np.abs(elevations - rings[ring]) < np.diff(rings).min() / 2
+        there = np.zeros((len(rings), options.sectors), np.bool_)
+        there[ring[close], self._sector[close]] = True
+        # A scanner with few bearings leaves some sectors out, by chance other ones in each ring.
+        there |= np.roll(there, 1, axis=1) | np.roll(there, -1, axis=1)
+        below = np.logical_and.accumulate(there, axis=0)
+        last_m, z_m, slope = ground.r_m[-1], ground.z_m[-1], ground.slope[-1]
+        for number in range(1, len(rings) - 1):
+            if self._height_m / math.tan(-rings[number]) > options.drop_range_m:
+                break
+            with np.errstate(divide="ignore", invalid="ignore"):
+                meets_m = (self._height_m - z_m + slope * last_m) / (slope + np.float32(math.tan(-rings[number])))
+            gone = below[number - 1] & ~there[number] & ~there[number + 1]
+            gone &= (last_m < meets_m) & (meets_m <= options.drop_range_m) & (meets_m < ranges_m)
+            edges_m = np.where(gone, np.minimum(edges_m, (last_m + meets_m) / 2), edges_m)
+        return edges_m
+
+    def _marks(
+        self, key: Indices, over: NDArray[np.float32], x: NDArray[np.float32], y: NDArray[np.float32]
+    ) -> tuple[Floats, Floats]:
+        """One point for each bin of a sector that has an obstacle, and how high it is there."""
+        tops = np.full(self._shape[0] * self._shape[1], -np.inf, np.float32)
+        np.maximum.at(tops, key, over)
+        places = np.empty((len(tops), 2), np.float32)
+        places[key, 0], places[key, 1] = x, y
+        there = np.flatnonzero(np.isfinite(tops))
+        return places[there].astype(np.float64), tops[there].astype(np.float64)
+
+    def _lowest(self, ground: "_Ground") -> NDArray[np.float32]:
+        """Of the rays that go on beyond a bin the lowest passes here; a ray that ends on the ground shows all of it."""
+        flattest = np.full(self._shape[0] * self._shape[1], np.inf, np.float32)
+        inclination = (self._z - np.float32(self._height_m)) / self._r
+        at = np.where(self._near, self._bin, self._shape[0] - 1) * self._shape[1] + self._sector
+        np.minimum.at(flattest, at, inclination)
+        beyond = np.minimum.accumulate(flattest.reshape(self._shape)[::-1], axis=0)[::-1]
+        lowest = np.full(self._shape, np.inf, np.float32)
+        middle = ((self._bins_m[1:] + self._bins_m[:-1]) / 2).astype(np.float32)[:-1, None]
+        level = ground.z_m[:-1] + ground.slope[:-1] * (middle - ground.r_m[:-1])
+        lowest[:-1] = np.float32(self._height_m) + middle * beyond[1:] - level
+        lowest[lowest < -1.5 * self._options.step_m] = np.inf  # a ray below the ground goes over a hole
+        lowest[ground.seen] = 0.0
+        return np.maximum(lowest, 0)
+
+
+class _Ground:
+    """The ground by bin and sector (bins, sectors): its height where it was last seen, at which range, how steep."""
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self.z_m = np.zeros(shape, np.float32)
+        self.r_m = np.zeros(shape, np.float32)
+        self.slope = np.zeros(shape, np.float32)
+        self.seen = np.zeros(shape, np.bool_)
+        self.edges_m = np.full(shape[1], np.inf)
