@@ -50,11 +50,14 @@ class PlannerOptions:
     allow_unknown: bool = True
     cost_travel_multiplier: float = 2.0
     """A cell's length counts 1 + so much of its cost, of 252."""
+    twin_travel_multiplier: float = 15.0
+    """The same for what the twin says stands there: a wall that only the twin has is worth a detour of some ten metres,
+    where Nav2's weight would lead into each dead end that it knows of. It never closes a way."""
     start_tolerance: float = 0.35
     """[m]: how far away a robot that touches an obstacle may begin its way. Nav2 has none: such a start is occupied."""
 
     def __post_init__(self) -> None:
-        for name in ("tolerance", "cost_travel_multiplier", "start_tolerance"):
+        for name in ("tolerance", "cost_travel_multiplier", "twin_travel_multiplier", "start_tolerance"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise UsageError(f"a planner with {name} {value}: give a number of 0 or more")
@@ -155,7 +158,8 @@ class _Search:
 
     def __init__(self, costmap: Costmap, free: Mask, begin: int, goal: int, options: PlannerOptions) -> None:
         grid = costmap.grid
-        factors = 1 + options.cost_travel_multiplier * costmap.weights() / MAX_NON_OBSTACLE
+        real, twin = options.cost_travel_multiplier, options.twin_travel_multiplier
+        factors = 1 + (real * costmap.costs.astype(np.float64) + twin * costmap.soft) / MAX_NON_OBSTACLE
         rows, columns = np.divmod(np.arange(grid.rows * grid.columns), grid.columns)
         goal_row, goal_column = divmod(goal, grid.columns)
         across, along = np.abs(columns - goal_column), np.abs(rows - goal_row)

@@ -5,7 +5,7 @@ say all of it: `kind` (phantom, unknown_obstacle), `east_m`, `north_m` and `radi
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 from sern_client.endpoints.base import SiteObjects
@@ -61,10 +61,13 @@ class SceneDiscrepancies:
         """Those of all sites, by id."""
         return tuple(each for _object_id, each in sorted(self._all.items()))
 
-    def saw(self, sights: list[Sight], twin: Cells, *, now_s: float, pose_error_m: float) -> None:
-        """Take what scans say, and compare it with the twin. By any thread, one at a time."""
-        for sight in sights:
-            self._world.saw(sight.free, sight.occupied)
+    def saw(
+        self, sights: Sequence[tuple[Sight, tuple[float, float]]], twin: Cells, *, now_s: float, pose_error_m: float
+    ) -> None:
+        """Take what scans say, each with where its scanner was, and compare it with the twin. By any thread, one at a
+        time."""
+        for sight, place_m in sights:
+            self._world.saw(sight.free, sight.occupied, place_m)
         self._found = self._world.compare(twin, now_s=now_s, pose_error_m=pose_error_m)
 
     def tell(self, now_s: float) -> None:

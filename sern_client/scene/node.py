@@ -35,7 +35,7 @@ from sern_runtime.metrics import Metrics
 from sern_twin.world.discrepancy import DiscrepancyKind, SeenDiscrepancy
 from sern_twin.world.grid import Grid
 from sern_twin.world.mesh import Mesh
-from sern_twin.world.occupancy import Occupancy, Sight
+from sern_twin.world.occupancy import Occupancy
 from sern_twin.world.offset import object_offset
 from sern_twin.world.patches import LAYERS, OCCUPIED, UNKNOWN, BlockKey, Cells, Refusal, read_header
 from sern_twin.world.scene import Scene
@@ -220,9 +220,12 @@ class SceneNode:
 
     def fuse(self, placed: list[Placed], twin: Cells) -> None:
         """Have scans change the occupancy, and compare them with the twin. Nobody else touches either meanwhile."""
-        sights: list[Sight] = [
-            self.occupancy.fuse(
-                each.pose, each.scan.angles_rad, each.scan.ranges_m, each.scan.most_m, range_min_m=each.scan.least_m
+        sights = [
+            (
+                self.occupancy.fuse(
+                    each.pose, each.scan.angles_rad, each.scan.ranges_m, each.scan.most_m, range_min_m=each.scan.least_m
+                ),
+                each.pose[:2],
             )
             for each in placed
         ]

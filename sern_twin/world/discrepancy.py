@@ -1,7 +1,8 @@
 """Where the twin and what a robot sees do not agree: things in the twin that are not there, and things that are.
 
-Each cell keeps what the last scans said that saw it. What they say, the twin may be a match radius off: the twin's
-place of a wall, the cells' size and the robot's own pose are. What is left is joined into discrepancies, each with a
+A cell is occupied, or clear, once three of the last five scans around it said so, and stays that until three of five
+say otherwise: one alone may be off. What they say, the twin may be a match radius off: the twin's place of a wall, the
+cells' size and the robot's own pose are. What is left is joined into discrepancies, each with a
 number that it keeps while it lasts. The robot's own sensors are right, always: the twin is what is to be corrected.
 """
 
@@ -19,13 +20,14 @@ from sern_twin.world.grid import Grid, need_cells
 from sern_twin.world.patches import FREE, OCCUPIED, Cells
 
 SCANS: Final = 5
-"""What so many of the last scans said that saw a cell."""
 AGREEING: Final = 3
-"""So many of them decide."""
+"""So many of the last `SCANS` decide. Not of those that saw a cell: behind a thin wall only those are that were off."""
 RADIUS_CELLS: Final = 2
 """The match radius at the least."""
 POSE_ERRORS: Final = 2.0
 """The match radius is so many times how far off the robot's pose may be."""
+RANGE_M: Final = 8.0
+"""What is further away from a scanner is not compared: half a degree is 7 cm there, and 18 cm at 20 m."""
 LEAST_CELLS: Final = 2
 """One cell alone is not said: it flickers at the edges of things."""
 KEEPS_S: Final = 2.0
@@ -85,35 +87,54 @@ class Discrepancies:
     def __init__(self, grid: Grid) -> None:
         self._grid = grid
         self._ends: NDArray[np.uint8] = np.zeros(grid.shape, np.uint8)
-        """A bit for each of the last scans that saw the cell: a ray ended in it. The newest is the lowest."""
+        """A bit for each of the last scans around the cell: a ray ended in it. The newest is the lowest."""
         self._passes: NDArray[np.uint8] = np.zeros(grid.shape, np.uint8)
         """The same: a ray passed."""
+        self._occupied: Mask = np.zeros(grid.shape, np.bool_)
+        self._clear: Mask = np.zeros(grid.shape, np.bool_)
         self._found: dict[DiscrepancyKind, Mask] = {kind: np.zeros(grid.shape, np.bool_) for kind in DiscrepancyKind}
         self._known: list[tuple[Discrepancy, NDArray[np.int64], float]] = []
         """Those of the last moments, with their cells and when they were found last; the newest first."""
         self._numbers = 0
         self.left_out = 0
 
-    def saw(self, free: Mask, occupied: Mask) -> None:
-        """One scan: through which cells it saw, and in which it ended, (rows, columns) each.
+    def saw(self, free: Mask, occupied: Mask, from_m: tuple[float, float] | None = None) -> None:
+        """One scan: through which cells it saw, and in which it ended, (rows, columns) each. `from_m`: where its
+        scanner was; what is further than `RANGE_M` from there says nothing. None: all counts.
 
         UsageError: another shape than the grid's.
         """
         if free.shape != self._grid.shape or occupied.shape != self._grid.shape:
             raise UsageError(f"a scan of {free.shape} and {occupied.shape} cells on a grid of {self._grid.shape}")
-        seen = free | occupied
-        for bits, said in ((self._ends, occupied), (self._passes, free & ~occupied)):
-            bits[seen] = (bits[seen] << 1 | said[seen]) & _LAST
+        rows, columns, around = self._around(from_m)
+        ends, passes = self._ends[rows, columns], self._passes[rows, columns]
+        ended, passed = occupied[rows, columns], free[rows, columns]
+        for bits, said in ((ends, ended), (passes, passed & ~ended)):
+            bits[around] = (bits[around] << 1 | said[around]) & _LAST
+        ended, passed = _COUNTS[ends] >= AGREEING, _COUNTS[passes] >= AGREEING
+        for state, begins, over in ((self._occupied, ended, passed), (self._clear, passed, ended)):
+            state[rows, columns] = (state[rows, columns] | begins) & ~over
+
+    def _around(self, place_m: tuple[float, float] | None) -> tuple[slice, slice, Mask]:
+        """Cells that are so near to a place: a rectangle, and which of its cells."""
+        grid = self._grid
+        if place_m is None:
+            return slice(0, grid.rows), slice(0, grid.columns), np.ones(grid.shape, np.bool_)
+        across = grid.centres(0, np.arange(grid.columns))[:, 0] - place_m[0]
+        along = grid.centres(np.arange(grid.rows), 0)[:, 1] - place_m[1]
+        rows, columns = (slice(*np.searchsorted(apart_m, (-RANGE_M, RANGE_M)).tolist()) for apart_m in (along, across))
+        near: Mask = along[rows, None] ** 2 + across[columns] ** 2 <= RANGE_M**2
+        return rows, columns, near
 
     @property
     def occupied(self) -> Mask:
-        """Cells in which the last scans ended, mostly."""
-        return _COUNTS[self._ends] >= AGREEING
+        """Cells in which scans end."""
+        return self._occupied.copy()
 
     @property
     def clear(self) -> Mask:
-        """Cells through which the last scans saw, mostly."""
-        return _COUNTS[self._passes] >= AGREEING
+        """Cells through which scans see."""
+        return self._clear.copy()
 
     def cells(self, kind: DiscrepancyKind) -> Mask:
         """Cells of all discrepancies of a kind, as of the last comparison, single ones too."""
@@ -122,7 +143,7 @@ class Discrepancies:
     def unobserved(self, twin: Cells) -> Mask:
         """Cells that the twin has something in, and of which the scans say nothing."""
         need_cells(twin, self._grid.shape, "a twin")
-        unseen: Mask = (twin >= OCCUPIED) & ~self.occupied & ~self.clear
+        unseen: Mask = (twin >= OCCUPIED) & ~self._occupied & ~self._clear
         return unseen
 
     def compare(self, twin: Cells, *, now_s: float, pose_error_m: float = 0.0) -> tuple[Discrepancy, ...]:
@@ -133,10 +154,13 @@ class Discrepancies:
         need_cells(twin, self._grid.shape, "a twin")
         if not 0 <= pose_error_m < np.inf:
             raise UsageError(f"a pose error of {pose_error_m} m")
-        has, occupied = twin >= OCCUPIED, self.occupied
+        has, occupied = twin >= OCCUPIED, self._occupied
+        # Rays that graze a wall see through its outermost cells: a phantom is clear as deep as the twin may be off, and
+        # one end in it speaks for it.
+        anything = occupied | (self._ends > 0) | (has & ~self._clear)
         radius_cells = max(float(RADIUS_CELLS), POSE_ERRORS * pose_error_m / self._grid.cell_m)
         self._found = {
-            DiscrepancyKind.PHANTOM: _beyond(has & self.clear, occupied, radius_cells),
+            DiscrepancyKind.PHANTOM: _beyond(has & self._clear, anything, radius_cells),
             DiscrepancyKind.UNKNOWN_OBSTACLE: _beyond((twin == FREE) & occupied, has, radius_cells),
         }
         found = [each for kind, mask in self._found.items() for each in self._joined(kind, mask, now_s)]

@@ -114,7 +114,7 @@ def test_a_number_stays_while_a_thing_does_and_is_not_used_again() -> None:
     assert [(each.number, each.since_s) for each in world.compare(twin(), now_s=9.0)] == [(3, 9.0)]
 
 
-def test_a_cell_changes_its_mind_with_three_of_the_last_five_scans_that_saw_it() -> None:
+def test_a_cell_changes_its_mind_with_three_of_the_last_five_scans() -> None:
     world = Discrepancies(GRID)
     scans(world, 50, CAR)
     scans(world, 2)
@@ -141,20 +141,31 @@ def test_one_cell_alone_is_not_said_and_the_largest_are_where_there_are_many() -
 def test_random_worlds_agree_with_a_slow_reading_of_the_rule() -> None:
     draw = np.random.default_rng(5)
     small = Grid(0.0, 0.0, 0.1, 24, 20)
-    for _ in range(40):
+    cells_of = [(row, column) for row in range(20) for column in range(24)]
+    for _ in range(30):
         world = Discrepancies(small)
-        history: list[list[list[bool]]] = [[[] for _ in range(24)] for _ in range(20)]
-        for _scan in range(int(draw.integers(1, 9))):
+        said: dict[tuple[int, int], list[str]] = {cell: [] for cell in cells_of}
+        state = dict.fromkeys(cells_of, "")
+        for _scan in range(int(draw.integers(1, 12))):
             seen, ends = draw.random(small.shape) < 0.8, draw.random(small.shape) < 0.3
             world.saw(seen & ~ends, seen & ends)
-            for row, column in zip(*seen.nonzero(), strict=True):
-                history[row][column].append(bool(ends[row, column]))
+            for cell in cells_of:
+                said[cell].append(("end" if ends[cell] else "pass") if seen[cell] else "")
+                last = said[cell][-5:]
+                if last.count("end") >= 3:
+                    state[cell] = "end"
+                elif last.count("pass") >= 3:
+                    state[cell] = "pass"
         cells = draw.choice(np.array([UNKNOWN, FREE, OCCUPIED], np.int8), small.shape, p=[0.2, 0.7, 0.1])
         found: list[Discrepancy] = list(world.compare(cells, now_s=1.0))
-        ended = np.array([[said[-5:].count(True) >= 3 for said in row] for row in history])
-        passed = np.array([[said[-5:].count(False) >= 3 for said in row] for row in history])
+        ended, passed = (
+            np.array([[state[row, column] == what for column in range(24)] for row in range(20)])
+            for what in ("end", "pass")
+        )
+        assert np.array_equal(world.occupied, ended) and np.array_equal(world.clear, passed)
+        lately = np.array([["end" in said[row, column][-5:] for column in range(24)] for row in range(20)])
         for kind, mine, others in (
-            (PHANTOM, (cells == OCCUPIED) & passed, ended),
+            (PHANTOM, (cells == OCCUPIED) & passed, ended | lately | ((cells == OCCUPIED) & ~passed)),
             (UNKNOWN_OBSTACLE, (cells == FREE) & ended, cells == OCCUPIED),
         ):
             places = np.argwhere(others)
@@ -170,6 +181,46 @@ def test_random_worlds_agree_with_a_slow_reading_of_the_rule() -> None:
             )
             assert np.array_equal(world.cells(kind), expected)
             assert sum(each.cells for each in found if each.kind is kind) <= expected.sum()
+
+
+def test_what_is_far_from_the_scanner_says_nothing_and_keeps_what_it_was() -> None:
+    world = Discrepancies(GRID)
+    here, there = (slice(20, 24), slice(2, 6)), (slice(20, 24), slice(94, 98))
+    ends = np.zeros(GRID.shape, np.bool_)
+    ends[here] = ends[there] = True
+    for _ in range(3):
+        world.saw(~ends, ends, (0.5, 2.0))
+    assert [round(each.east_m, 1) for each in world.compare(twin(), now_s=1.0)] == [0.4], "9 m are too far"
+    for _ in range(5):
+        world.saw(np.ones(GRID.shape, np.bool_), np.zeros(GRID.shape, np.bool_), (9.5, 2.0))
+    assert len(world.compare(twin(), now_s=2.0)) == 1, "the scanner has left"
+    for place_m in ((-50.0, 2.0), (5.0, 70.0)):
+        world.saw(~ends, ends, place_m)
+    assert len(world.compare(twin(), now_s=3.0)) == 1
+
+
+def test_the_face_of_a_wall_that_rays_graze_is_no_phantom() -> None:
+    """They see through its outermost cells, and none of them ends there; what is behind them no ray reaches."""
+    world = Discrepancies(GRID)
+    free = np.zeros(GRID.shape, np.bool_)
+    free[:21] = True
+    for _ in range(20):
+        world.saw(free, np.zeros(GRID.shape, np.bool_))
+    assert world.compare(twin(wall=(slice(20, 24), slice(0, 100))), now_s=1.0) == ()
+    fence = twin(fence=(slice(19, 20), slice(0, 100)))
+    assert [each.kind for each in world.compare(fence, now_s=2.0)] == [PHANTOM], "a thin thing that they see through"
+
+
+def test_what_only_the_scans_saw_that_were_off_is_nothing() -> None:
+    """A cell behind a thin wall: one scan in five is off, and ends there; the others do not see it."""
+    world = Discrepancies(GRID)
+    wall, behind = np.zeros(GRID.shape, np.bool_), np.zeros(GRID.shape, np.bool_)
+    wall[20], behind[24] = True, True
+    free = np.zeros(GRID.shape, np.bool_)
+    free[:20] = True
+    for step in range(100):
+        world.saw(free, behind if step % 5 == 0 else wall)
+    assert world.compare(twin(wall=(slice(20, 21), slice(0, 100))), now_s=1.0) == ()
 
 
 def test_what_is_of_another_grid_is_refused() -> None:
