@@ -98,7 +98,7 @@ class Mapper:
         if stands.any():
             self.occupancy.fuse(scanner, scan.bearings_rad[stands], scan.ranges_m[stands], furthest_m + 1)
         open_m = min(self._options.free_m, furthest_m)
-        free = ~np.isfinite(scan.ranges_m) & (scan.ground_m >= open_m)
+        free = ~np.isfinite(scan.ranges_m) & (scan.ground_m[:, 1] >= open_m)
         if free.any():
             self.occupancy.fuse(scanner, scan.bearings_rad[free], np.full(int(free.sum()), np.inf), open_m)
 

@@ -26,6 +26,8 @@ MOST_POINTS: Final = 1_000_000
 VLP16_RAD: Final = tuple(math.radians(degrees) for degrees in range(-15, 16, 2))
 """Elevations of the 16 rings that Velodyne's VLP-16 and the simulated robot have."""
 _FINE_M: Final = 0.05
+_BEFORE_M: Final = 0.12
+"""An edge is said to be so far before a hole that is sure: rays are a quarter of a metre apart where it matters."""
 _TURN: Final = 2 * math.pi
 
 
@@ -110,9 +112,10 @@ class ObstacleScan:
     """What a scan says of its surroundings, in bearings from the scanner, counter-clockwise from -π.
 
     `ranges_m` (sectors,): S_2D, the nearest obstacle or edge; inf where none is. `drops` (sectors,): it is an edge.
-    `ground_m` (sectors,): how far ground was seen; 0 where nothing was. `points_m` (n, 2): all obstacles and edges in
-    the robot's frame; `tops_m` (n,): how high above the ground they reach. `lowest_m` (bins, sectors): how low the
-    lowest ray passed above the ground; inf where none did. `bins_m` (bins + 1,): the edges of the bins.
+    `ground_m` (sectors, 2): from where to where ground was seen without an edge in it; 0, 0 where it was not.
+    `points_m` (n, 2): all obstacles and edges in the robot's frame; `tops_m` (n,): how high they reach above
+    the ground, 0 for edges. `lowest_m` (bins, sectors): how low the lowest ray passed above the ground; inf where none did.
+    `bins_m` (bins + 1,): where the bins begin and end.
     """
 
     stamp_s: float
@@ -191,7 +194,8 @@ def planar_scan(
     points = ranges[ends, None] * directions + options.origin_m[:2]
     tops = np.full(len(points), options.origin_m[2])
     no_drops = np.zeros(options.sectors, np.bool_)
-    return ObstacleScan(stamp_s, options.origin_m[:2], nearest, no_drops, seen_m, points, tops, lowest, bins_m)
+    ground = np.stack((np.zeros(options.sectors), seen_m), axis=1)
+    return ObstacleScan(stamp_s, options.origin_m[:2], nearest, no_drops, ground, points, tops, lowest, bins_m)
 
 
 def _columns(points: NDArray[Any]) -> NDArray[np.float32] | Refused:
@@ -251,14 +255,13 @@ class _Reading:
         bearings = middles(options.sectors)[at_edge]
         edge_points = edges_m[at_edge, None] * np.stack((np.cos(bearings), np.sin(bearings)), axis=1)
         points_m = np.concatenate((points_m, edge_points)) + options.origin_m[:2]
-        tops_m = np.concatenate((tops_m, np.full(len(edge_points), options.min_obstacle_height)))
-        seen = np.where(ground.seen, self._bins_m[1:, None], 0.0).max(axis=0)
+        tops_m = np.concatenate((tops_m, np.zeros(len(edge_points))))
         return ObstacleScan(
             stamp_s,
             options.origin_m[:2],
             np.minimum(ranges_m, edges_m),
             at_edge,
-            seen,
+            self._extent(ground, edges_m),
             points_m,
             tops_m,
             self._lowest(ground),
@@ -334,12 +337,13 @@ class _Reading:
     ) -> Floats:
         """Where the ground ends that goes on from a place with a slope, if a ray that passes it ends lower.
 
-        The edge lies between the last ground and where the ray goes below it; the middle is the least off.
+        The edge lies between the last ground and where the ray goes below it. The middle is the least off; where the
+        two are far apart it is said late rather than where ground is, and better when the robot is nearer.
         """
         with np.errstate(divide="ignore", invalid="ignore"):
             ray = (self._height_m - low_z) / low_r
             ahead = (self._height_m - at_z + slope * at_r) / (slope + ray)
-            edges = np.maximum((at_r + ahead) / 2, ahead - 0.25)
+            edges = np.maximum((at_r + ahead) / 2, ahead - _BEFORE_M)
         return np.maximum(edges, self._options.range_min_m).astype(np.float64)
 
     def _missing(self, ground: "_Ground", ranges_m: Floats) -> Floats:
@@ -370,6 +374,14 @@ class _Reading:
             gone &= (last_m < meets_m) & (meets_m <= options.drop_range_m) & (meets_m < ranges_m)
             edges_m = np.where(gone, np.minimum(edges_m, (last_m + meets_m) / 2), edges_m)
         return edges_m
+
+    def _extent(self, ground: "_Ground", edges_m: Floats) -> Floats:
+        """From where to where there is ground, (sectors, 2): from the first that was seen on, up to an edge."""
+        starts, ends = self._bins_m[:-1, None], self._bins_m[1:, None]
+        seen = ground.seen & (starts < edges_m)
+        first = np.where(seen, starts, np.inf).min(axis=0)
+        last = np.where(seen, np.minimum(ends, edges_m), 0.0).max(axis=0)
+        return np.stack((np.where(last > 0, first, 0.0), last), axis=1)
 
     def _marks(
         self, key: Indices, over: NDArray[np.float32], x: NDArray[np.float32], y: NDArray[np.float32]

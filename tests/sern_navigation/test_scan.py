@@ -45,7 +45,7 @@ def lifted(where: NDArray[np.bool_], height_m: float) -> Floats:
 def test_nothing_stands_on_level_ground() -> None:
     scan = scan_of(level)
     assert not np.isfinite(scan.ranges_m).any() and not scan.drops.any()
-    assert len(scan.points_m) == 0 and (scan.ground_m > 7.0).all()
+    assert len(scan.points_m) == 0 and (scan.ground_m[:, 1] > 7.0).all() and (scan.ground_m[:, 0] < 1.6).all()
     assert scan.bearings_rad[0] == pytest.approx(-math.pi + math.pi / 360)
 
 
@@ -104,6 +104,7 @@ def test_a_ditch_is_an_edge_before_it_begins(edge_m: float) -> None:
     found = scan.ranges_m[ahead(scan)]
     assert (found < edge_m + 0.3).all() and (found > edge_m - 0.45).all(), found
     assert scan.drops[ahead(scan)].all()
+    assert (scan.ground_m[ahead(scan), 1] <= found).all(), "and ground is said to be there up to it"
     assert not scan.drops[np.abs(scan.bearings_rad) > 2.0].any()
 
 
