@@ -29,6 +29,7 @@ _FINE_M: Final = 0.05
 _BEFORE_M: Final = 0.12
 """An edge is said to be so far before a hole that is sure: rays are a quarter of a metre apart where it matters."""
 _TURN: Final = 2 * math.pi
+_MOST_TILT_RAD: Final = 0.7
 
 
 class Unusable(StrEnum):
@@ -48,12 +49,16 @@ class Unusable(StrEnum):
 class Cloud:
     """Points of one turn of a scanner in the robot's own frame: x forward, y left, z up from the ground below it [m].
 
-    `points_m` is (n, 3) or wider, or an array with fields x, y and z. Missing returns are NaN.
+    `points_m` is (n, 3) or wider, or an array with fields x, y and z. Missing returns are NaN. Roll and pitch (REP 103:
+    nose down is positive) are those of the robot, where they are known: one with its front wheels on a step looks up,
+    and level ground ahead of it seems to fall.
     """
 
     points_m: NDArray[Any]
     stamp_s: float
     frame_id: str = "base_link"
+    roll_rad: float = 0.0
+    pitch_rad: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,8 +119,8 @@ class ObstacleScan:
     `ranges_m` (sectors,): S_2D, the nearest obstacle or edge; inf where none is. `drops` (sectors,): it is an edge.
     `ground_m` (sectors, 2): from where to where ground was seen without an edge in it; 0, 0 where it was not.
     `points_m` (n, 2): all obstacles and edges in the robot's frame; `tops_m` (n,): how high they reach above
-    the ground, 0 for edges. `lowest_m` (bins, sectors): how low the lowest ray passed above the ground; inf where none did.
-    `bins_m` (bins + 1,): where the bins begin and end.
+    the ground, 0 for edges. `lowest_m` (bins, sectors): how low the lowest ray passed above the ground; inf where none
+    did. `bins_m` (bins + 1,): where the bins begin and end.
     """
 
     stamp_s: float
@@ -162,7 +167,9 @@ def obstacle_scan(cloud: Cloud, options: ScanOptions) -> ObstacleScan | Refused:
     finite = np.isfinite(points).all(axis=1)
     if not finite.any() or not math.isfinite(cloud.stamp_s):
         return Refused(Unusable.NOT_FINITE, f"a cloud of {len(points)} points, none of them finite, or without a time")
-    return _Reading(points[finite] - np.array(options.origin_m, np.float32), options).scan(cloud.stamp_s)
+    return _Reading(points[finite] - np.array(options.origin_m, np.float32), _level(cloud, options), options).scan(
+        cloud.stamp_s
+    )
 
 
 def planar_scan(
@@ -214,6 +221,16 @@ def _columns(points: NDArray[Any]) -> NDArray[np.float32] | Refused:
         return points[:, :3].astype(np.float32)
 
 
+def _level(cloud: Cloud, options: ScanOptions) -> NDArray[np.float32]:
+    """How level ground rises in the robot's frame at each bearing, (sectors,); none where its attitude is no use."""
+    roll, pitch = cloud.roll_rad, cloud.pitch_rad
+    if not (abs(roll) <= _MOST_TILT_RAD and abs(pitch) <= _MOST_TILT_RAD):  # and no NaN
+        return np.zeros(options.sectors, np.float32)
+    bearings = middles(options.sectors)
+    rise = math.tan(pitch) / math.cos(roll) * np.cos(bearings) - math.tan(roll) * np.sin(bearings)
+    return rise.astype(np.float32)
+
+
 def _sectors(bearings_rad: NDArray[np.floating[Any]], sectors: int) -> Indices:
     found: Indices = np.floor((bearings_rad + math.pi) * (sectors / _TURN)).astype(np.intp) % sectors
     return found
@@ -222,8 +239,9 @@ def _sectors(bearings_rad: NDArray[np.floating[Any]], sectors: int) -> Indices:
 class _Reading:
     """One cloud, (n, 3) from the scanner on: its walks outwards, all bearings at once."""
 
-    def __init__(self, points: NDArray[np.float32], options: ScanOptions) -> None:
+    def __init__(self, points: NDArray[np.float32], level: NDArray[np.float32], options: ScanOptions) -> None:
         self._options = options
+        self._level = level
         self._height_m = options.origin_m[2]
         self._bins_m = bin_edges_m(options.range_max_m)
         self._shape = len(self._bins_m) - 1, options.sectors
@@ -290,13 +308,16 @@ class _Reading:
                 along = np.maximum(low_r[number] - at_r, np.float32(1e-3))
                 up = np.where(there, low_z[number] - at_z, 0)
                 tilt = up / along
-                bend = tilt - slope
+                # At first it goes on as the robot stands, or level, whichever is nearer to what is seen.
+                first = np.where(np.abs(tilt - self._level) < np.abs(tilt), self._level, 0)
+                before = np.where(at_r > 0, slope, first)
+                bend = tilt - before
                 too_steep = (up > options.step_m) & ((tilt > steepest) | (bend > rise))
                 sunk = bend * along < -1.5 * options.step_m
                 falls = sunk & ((tilt < -steepest) | ((bend < -fall) & (at_r <= options.drop_range_m)))
                 dips = sunk & (bend < -fall / 2) & (at_r <= options.drop_range_m)
                 if dips.any() or falls.any():
-                    edges_m = self._edges_m(at_r, at_z, slope, low_r[number], low_z[number])
+                    edges_m = self._edges_m(at_r, at_z, before, low_r[number], low_z[number])
                     ground.edges_m[falls] = np.minimum(ground.edges_m, edges_m)[falls]
                     ditch_m = np.where(dips, edges_m, ditch_m)
                 other_side = too_steep | (dips & stands[number])
@@ -306,7 +327,7 @@ class _Reading:
                 at_z = np.where(is_ground, low_z[number], at_z)
                 at_r = np.where(is_ground, low_r[number], at_r)
                 # Two points close to each other say little of a slope.
-                slope = np.where(is_ground, np.clip(tilt, -steepest, steepest) * np.minimum(along / 0.3, 1), slope)
+                slope = np.where(is_ground, np.clip(tilt, -steepest, steepest) * np.minimum(along / 0.2, 1), slope)
                 ground.seen[number] = is_ground
             ground.z_m[number], ground.r_m[number], ground.slope[number] = at_z, at_r, slope
         return ground

@@ -108,6 +108,23 @@ def test_a_ditch_is_an_edge_before_it_begins(edge_m: float) -> None:
     assert not scan.drops[np.abs(scan.bearings_rad) > 2.0].any()
 
 
+@pytest.mark.parametrize(("roll_rad", "pitch_rad"), [(0.0, -0.16), (0.0, 0.16), (0.16, 0.0), (-0.1, -0.12)])
+def test_a_robot_that_stands_askew_on_a_step_sees_that_the_ground_is_level(roll_rad: float, pitch_rad: float) -> None:
+    level_points = looking_at(level)
+    cos_r, sin_r, cos_p, sin_p = math.cos(roll_rad), math.sin(roll_rad), math.cos(pitch_rad), math.sin(pitch_rad)
+    turned = np.array(
+        [[cos_p, sin_r * sin_p, cos_r * sin_p], [0.0, cos_r, -sin_r], [-sin_p, sin_r * cos_p, cos_r * cos_p]]
+    )
+    points = level_points @ turned  # a row of the world's axes times this is one of the robot's
+    blind = used(obstacle_scan(Cloud(points, 0.0), OPTIONS))
+    assert blind.drops.any(), "otherwise this says nothing"
+    scan = used(obstacle_scan(Cloud(points, 0.0, roll_rad=roll_rad, pitch_rad=pitch_rad), OPTIONS))
+    assert not scan.drops.any() and not (scan.ranges_m < 6.0).any()
+    for wrong in (math.nan, math.inf, 2.0):
+        same = used(obstacle_scan(Cloud(points, 0.0, roll_rad=wrong), OPTIONS))
+        assert (same.ranges_m == blind.ranges_m).all(), "an attitude that is none is not used"
+
+
 def test_a_bridge_over_a_ditch_is_free() -> None:
     def ground(x: Floats, y: Floats) -> Floats:
         ditch = np.clip((0.9 - np.abs(x - 2.9)) / 0.5, 0.0, 1.0) * 0.8
