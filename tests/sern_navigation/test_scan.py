@@ -110,12 +110,9 @@ def test_a_ditch_is_an_edge_before_it_begins(edge_m: float) -> None:
 
 @pytest.mark.parametrize(("roll_rad", "pitch_rad"), [(0.0, -0.16), (0.0, 0.16), (0.16, 0.0), (-0.1, -0.12)])
 def test_a_robot_that_stands_askew_on_a_step_sees_that_the_ground_is_level(roll_rad: float, pitch_rad: float) -> None:
-    level_points = looking_at(level)
-    cos_r, sin_r, cos_p, sin_p = math.cos(roll_rad), math.sin(roll_rad), math.cos(pitch_rad), math.sin(pitch_rad)
-    turned = np.array(
-        [[cos_p, sin_r * sin_p, cos_r * sin_p], [0.0, cos_r, -sin_r], [-sin_p, sin_r * cos_p, cos_r * cos_p]]
-    )
-    points = level_points @ turned  # a row of the world's axes times this is one of the robot's
+    """Level ground is a plane that is askew in its frame."""
+    forward, left = math.tan(pitch_rad) / math.cos(roll_rad), -math.tan(roll_rad)
+    points = looking_at(lambda x, y: forward * x + left * y)
     blind = used(obstacle_scan(Cloud(points, 0.0), OPTIONS))
     assert blind.drops.any(), "otherwise this says nothing"
     scan = used(obstacle_scan(Cloud(points, 0.0, roll_rad=roll_rad, pitch_rad=pitch_rad), OPTIONS))
