@@ -251,9 +251,11 @@ class Navigator:
         *,
         speed: Speed | None = None,
     ) -> Command:
-        """The command of this cycle. `speed`: what the robot measures of itself; None: what it was told last.
+        """The command of this cycle. `speed`: what the robot measures of itself; None: what it was told last, as with
+        Nav2's open_loop.
 
-        The scan is of the robot where `pose` has it. It is given once; without one the last one ages.
+        The scan is of the robot where `pose` has it. It is given once; without one the last one ages. Time does not go
+        back. A step in which the path is planned anew takes as long as `global_plan.plan` more.
         """
         if not (math.isfinite(now_s) and now_s >= self._now_s):
             self._unused[Unused.TIME] += 1
