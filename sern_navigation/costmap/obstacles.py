@@ -84,9 +84,12 @@ class ObstacleLayer:
         if self.options.footprint_clearing_enabled:
             window = around(self.grid, x_m, y_m, self._radius_m)
             if not window.empty:
-                here = np.hypot(*self._offsets(window, x_m, y_m)) <= self._radius_m
-                # But an edge may well be where a part of it is.
-                self._marked[window.slices] &= ~here | self._edges[window.slices]
+                away_m = np.hypot(*self._offsets(window, x_m, y_m))
+                here = away_m <= self._radius_m
+                # But an edge may well be where a part of it is; not where its middle is, or it would have fallen.
+                edges = self._edges[window.slices]
+                edges &= away_m > self._radius_m / 2
+                self._marked[window.slices] &= ~here | edges
                 self._free[window.slices] |= here & ~self._marked[window.slices]
 
     def costs(self, window: Window) -> Costs:

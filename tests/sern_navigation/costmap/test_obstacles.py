@@ -120,8 +120,9 @@ def test_an_edge_stays_until_ground_is_seen_in_its_place() -> None:
         layer.observe((1.5, 0.0, 1.5), nearer)
         layer.clear()
     assert marked(layer, 2.0, 0.0)
-    layer.observe((1.9, 0.0, 0.0), nearer)
+    layer.observe((1.7, 0.0, 0.0), nearer)
     assert marked(layer, 2.0, 0.0)
+    assert cost(layer, 1.7, 0.0) == FREE_SPACE, "its own middle is on firm ground"
     layer.observe((-0.5, 0.0, 0.0), scan_of(level))
     assert not marked(layer, 2.0, 0.0), "it was none"
 
