@@ -31,7 +31,7 @@ from sern_navigation.costmap.twin import TwinView
 from sern_navigation.global_plan import Plan, PlanCode, PlannerOptions, plan
 from sern_navigation.mppi import ControlCode, Mppi, MppiOptions, pruned
 from sern_navigation.recovery import Behaviour, Progress, Recovery, RecoveryOptions
-from sern_navigation.scan import Cloud, ObstacleScan, Refused, ScanOptions, obstacle_scan
+from sern_navigation.scan import Cloud, ObstacleScan, Refused, ScanOptions, obstacle_scan, turned
 from sern_twin.world.grid import NOWHERE, Floats, Grid
 from sern_twin.world.occupancy import MOST_M, MOST_RAD, Pose
 from sern_twin.world.patches import Cells
@@ -189,6 +189,7 @@ class Navigator:
         self._goal: Goal | None = None
         self._scan_s: float | None = None
         self._scan_points: Floats = _NO_PATH
+        self._scan_pose: Pose | None = None
         self._complaint = ""
         self._now_s = -math.inf
         self._speed: Speed = STOPPED
@@ -271,11 +272,7 @@ class Navigator:
             self._unused[Unused.SPEED] += 1
             speed = None
         wanted, trajectory = self._wanted(now_s, pose, speed or self._speed)
-        points = self._scan_points
-        if pose is not None:
-            near = self.costmap.obstacles.marks_near(pose, self.options.local_radius_m)
-            points = np.concatenate((points, near))
-        verdict = self.monitor.process(wanted, points, self._scan_s, now_s)
+        verdict = self.monitor.process(wanted, self._real_points(pose), self._scan_s, now_s)
         self._speed = verdict.command
         return self._command(wanted, trajectory, verdict)
 
@@ -294,9 +291,21 @@ class Navigator:
             self._unused[Unused.SCAN_LATE] += 1
             self._complaint = f"a scan of {now_s - found.stamp_s:.1f} s ago is too old, or from the future"
             return
-        self._scan_s, self._scan_points, self._complaint = found.stamp_s, found.points_m, ""
+        self._scan_s, self._scan_points, self._scan_pose = found.stamp_s, found.points_m, pose
+        self._complaint = ""
         if pose is not None:
             self.costmap.obstacles.observe(pose, found)
+
+    def _real_points(self, pose: Pose | None) -> Floats:
+        """What real sensors have seen, (n, 2) in the robot's frame as it is now: the last scan and all marks."""
+        if pose is None:
+            return self._scan_points
+        points = self._scan_points
+        if self._scan_pose is not None and self._scan_pose != pose:
+            x_m, y_m, yaw_rad = self._scan_pose
+            to_x_m, to_y_m = turned(np.array([x_m - pose[0], y_m - pose[1]]), -pose[2]).tolist()
+            points = turned(points, yaw_rad - pose[2]) + np.array([to_x_m, to_y_m])
+        return np.concatenate((points, self.costmap.obstacles.marks_near(pose, self.options.local_radius_m)))
 
     def _sees(self, now_s: float) -> bool:
         return self._scan_s is not None and abs(now_s - self._scan_s) <= self.options.monitor.source_timeout

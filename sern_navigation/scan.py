@@ -145,6 +145,13 @@ def middles(sectors: int) -> Floats:
     return found
 
 
+def turned(points: Floats, yaw_rad: float) -> Floats:
+    """Points (..., 2) turned about the origin, counter-clockwise."""
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    found: Floats = points @ np.array([[cos, sin], [-sin, cos]])
+    return found
+
+
 def bin_edges_m(range_max_m: float) -> Floats:
     """The edges of the bins of distance: a tenth of a metre wide, two from 2.5 m on, four from 5 m on."""
     edges = [*(0.1 * number for number in range(25)), *(2.5 + 0.2 * number for number in range(12)), 4.9]

@@ -13,7 +13,7 @@ import numpy as np
 
 from sern_core.vocabulary.errors import UsageError
 from sern_navigation.costmap.costs import FREE_SPACE, LETHAL_OBSTACLE, NO_INFORMATION, Costs, Mask, Window, around
-from sern_navigation.scan import ObstacleScan
+from sern_navigation.scan import ObstacleScan, turned
 from sern_twin.world.grid import NOWHERE, Floats, Grid
 from sern_twin.world.occupancy import Pose
 
@@ -77,9 +77,8 @@ class ObstacleLayer:
     def observe(self, pose: Pose, scan: ObstacleScan) -> None:
         """Take a scan from where the robot is: clear, then mark. All of the pose is finite."""
         x_m, y_m, yaw_rad = pose
-        cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-        left_m, up_m = scan.origin_m
-        self._clear(x_m + cos * left_m - sin * up_m, y_m + sin * left_m + cos * up_m, yaw_rad, scan)
+        forward_m, left_m = turned(np.array(scan.origin_m), yaw_rad).tolist()
+        self._clear(x_m + forward_m, y_m + left_m, yaw_rad, scan)
         self._mark(pose, scan)
         if self.options.footprint_clearing_enabled:
             window = around(self.grid, x_m, y_m, self._radius_m)
@@ -103,9 +102,7 @@ class ObstacleLayer:
         window = around(self.grid, x_m, y_m, radius_m)
         rows, columns = np.nonzero(self._marked[window.slices])
         places = self.grid.centres(rows + window.first_row, columns + window.first_column) - [x_m, y_m]
-        cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-        found: Floats = places @ np.array([[cos, -sin], [sin, cos]])
-        return found
+        return turned(places, -yaw_rad)
 
     def clear(self) -> None:
         """Forget all that the next scan would show: Nav2's clearing of the costmap, but for what is near and below
@@ -158,9 +155,7 @@ class ObstacleLayer:
         ranges = np.hypot(*(scan.points_m - scan.origin_m).T)
         near = (ranges >= options.obstacle_min_range) & (ranges <= options.obstacle_max_range)
         x_m, y_m, yaw_rad = pose
-        cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-        places = scan.points_m[near] @ np.array([[cos, sin], [-sin, cos]]) + [x_m, y_m]
-        cells = self.grid.flat(places)
+        cells = self.grid.flat(turned(scan.points_m[near], yaw_rad) + np.array([x_m, y_m]))
         on_grid = cells != NOWHERE
         cells = cells[on_grid]
         tops, found_m = self._tops_m.reshape(-1), scan.tops_m[near][on_grid].astype(np.float32)

@@ -9,6 +9,8 @@ import pytest
 
 from sern_core.vocabulary.errors import UsageError
 from sern_navigation.collision_monitor import Action
+from sern_navigation.costmap.layered import CostmapOptions
+from sern_navigation.costmap.obstacles import ObstacleOptions
 from sern_navigation.costmap.static import MapOutcome
 from sern_navigation.costmap.twin import TwinView
 from sern_navigation.mppi import MppiOptions
@@ -159,6 +161,19 @@ def test_when_its_eyes_fail_it_stands_within_the_time_and_goes_on_when_they_see_
     stands(blind[-1], State.FOLLOWING, Code.NO_PERCEPTION)
     assert all(command.speed == (0.0, 0.0) for command in blind[10:])
     assert run(one, 1.0, start_s=4.0).speed[0] > 0.2
+
+
+def test_a_scan_of_a_moment_ago_is_seen_from_where_the_robot_is_now() -> None:
+    """A pillar 1.2 m ahead, and no scan while the robot drives 0.7 m towards it and turns: it is at its left then."""
+    one = navigator(options=replace(OPTIONS, costmap=CostmapOptions(obstacles=ObstacleOptions(obstacle_max_range=0.5))))
+    one.go(Goal(3.0, 0.0))
+    pillar = looking_at(lambda x, y: np.where(np.hypot(x - 1.2, y) < 0.1, 1.0, 0.0))
+    one.step(0.0, HERE, Cloud(pillar, 0.0))
+    assert not one.costmap.obstacles.lethal.any(), "it is not marked, so that the scan alone can show it"
+    ahead = one.step(0.5, (0.8, 0.0, 0.0))
+    assert ahead.wanted[0] > 0.2 and ahead.verdict.action is Action.STOP and ahead.verdict.polygon == "PolygonStop"
+    beside = one.step(0.6, (0.8, 0.0, -math.pi / 2))
+    assert beside.verdict.polygon != "PolygonStop"
 
 
 def test_scans_that_come_late_are_not_believed() -> None:
