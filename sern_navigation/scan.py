@@ -86,9 +86,9 @@ class ScanOptions:
     max_slope_rad: float = 0.35
     max_rise_rad: float = 0.26
     """How much steeper than the ground before it ground may be."""
-    max_fall_rad: float = 0.13
+    max_fall_rad: float = 0.17
     """The same downwards, up to `drop_range_m`: behind an edge the next ray meets ground far away, little lower. Ground
-    that falls half as much and then rises steeply is a ditch."""
+    that falls a third as much and then rises steeply is a ditch."""
     step_m: float = 0.06
     """A step up that is driven over, and half as much more downwards."""
     drop_range_m: float = 4.0
@@ -322,7 +322,7 @@ class _Reading:
                 too_steep = (up > options.step_m) & ((tilt > steepest) | (bend > rise))
                 sunk = bend * along < -1.5 * options.step_m
                 falls = sunk & ((tilt < -steepest) | ((bend < -fall) & (at_r <= options.drop_range_m)))
-                dips = sunk & (bend < -fall / 2) & (at_r <= options.drop_range_m)
+                dips = sunk & (bend < -fall / 3) & (at_r <= options.drop_range_m)
                 if dips.any() or falls.any():
                     edges_m = self._edges_m(at_r, at_z, before, low_r[number], low_z[number])
                     ground.edges_m[falls] = np.minimum(ground.edges_m, edges_m)[falls]

@@ -50,10 +50,11 @@ def test_nothing_stands_on_level_ground() -> None:
 
 
 @pytest.mark.parametrize("degrees", [-10.0, -5.0, 5.0, 10.0])
-def test_a_slope_is_no_obstacle(degrees: float) -> None:
-    """The robot stands on level ground, and the slope begins 1 m ahead."""
+@pytest.mark.parametrize("begins_m", [0.7, 1.0, 1.6, 2.2, 3.0])
+def test_a_slope_is_no_obstacle(degrees: float, begins_m: float) -> None:
+    """The robot stands on level ground, and a slope of 2 m begins somewhere ahead."""
     rise = math.tan(math.radians(degrees))
-    scan = scan_of(lambda x, y: rise * np.maximum(np.hypot(x, y) - 1.0, 0.0))
+    scan = scan_of(lambda x, y: rise * np.clip(np.hypot(x, y) - begins_m, 0.0, 2.0))
     near = scan.ranges_m < 5.0
     assert not near.any(), scan.ranges_m[near]
 
@@ -108,7 +109,7 @@ def test_a_ditch_is_an_edge_before_it_begins(edge_m: float) -> None:
     assert not scan.drops[np.abs(scan.bearings_rad) > 2.0].any()
 
 
-@pytest.mark.parametrize(("roll_rad", "pitch_rad"), [(0.0, -0.16), (0.0, 0.16), (0.16, 0.0), (-0.1, -0.12)])
+@pytest.mark.parametrize(("roll_rad", "pitch_rad"), [(0.0, -0.19), (0.0, 0.19), (0.19, 0.0), (-0.13, -0.15)])
 def test_a_robot_that_stands_askew_on_a_step_sees_that_the_ground_is_level(roll_rad: float, pitch_rad: float) -> None:
     """Level ground is a plane that is askew in its frame."""
     forward, left = math.tan(pitch_rad) / math.cos(roll_rad), -math.tan(roll_rad)
@@ -120,6 +121,19 @@ def test_a_robot_that_stands_askew_on_a_step_sees_that_the_ground_is_level(roll_
     for wrong in (math.nan, math.inf, 2.0):
         same = used(obstacle_scan(Cloud(points, 0.0, roll_rad=wrong), OPTIONS))
         assert (same.ranges_m == blind.ranges_m).all(), "an attitude that is none is not used"
+
+
+@pytest.mark.parametrize("deep_m", [0.2, 0.3, 0.5, 1.0])
+def test_a_step_down_is_an_edge_before_it_is_too_near_to_be_seen(deep_m: float) -> None:
+    """The lowest ray meets the ground 1.49 m ahead. What is seen of a small step from further away is as of a slope."""
+    found = []
+    for edge_m in np.arange(1.5, 1.75, 0.05).tolist():
+        scan = scan_of(lambda x, y, edge_m=edge_m: lifted(x > edge_m, -deep_m))  # type: ignore[misc]
+        seen_m = scan.ranges_m[ahead(scan) & scan.drops]
+        assert seen_m == pytest.approx(edge_m, abs=0.3)
+        assert not (scan.ranges_m[np.abs(scan.bearings_rad) > 2.0] < 6.0).any()
+        found.append(len(seen_m) == np.count_nonzero(ahead(scan)))
+    assert sum(found) >= 3, "from most of these places"
 
 
 def test_a_bridge_over_a_ditch_is_free() -> None:
