@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sern_core.vocabulary.errors import UsageError
 from sern_twin.world.grid import Floats
+from sern_twin.world.occupancy import MOST_RAD
 
 Indices = NDArray[np.intp]
 
@@ -30,6 +31,8 @@ _BEFORE_M: Final = 0.12
 """An edge is said to be so far before a hole that is sure: rays are a quarter of a metre apart where it matters."""
 _TURN: Final = 2 * math.pi
 _MOST_TILT_RAD: Final = 0.7
+_MOST_M: Final = 1e4
+"""Nothing is so far away, and its square is a number still."""
 
 
 class Unusable(StrEnum):
@@ -41,6 +44,8 @@ class Unusable(StrEnum):
     EMPTY = "empty"
     NOT_FINITE = "not_finite"
     """No point of it has three finite numbers, or its time is none."""
+    TOO_FEW = "too_few"
+    """Fewer than `min_points` are of its surroundings: the scanner is covered, or sees the robot alone."""
     TOO_LARGE = "too_large"
     OTHER_FRAME = "other_frame"
 
@@ -80,6 +85,8 @@ class ScanOptions:
     range_min_m: float = 0.35
     """What is nearer is the robot itself."""
     range_max_m: float = 10.0
+    min_points: int = 30
+    """A cloud of fewer is none."""
     min_obstacle_height: float = 0.10
     max_obstacle_height: float = 2.0
     """[m] above the ground, where Nav2 has them above the frame's zero."""
@@ -96,9 +103,11 @@ class ScanOptions:
     """Rings that meet the ground within `drop_range_m` must be there. None: missing ground is not looked for."""
 
     def __post_init__(self) -> None:
-        if not 8 <= self.sectors <= 3600:
-            raise UsageError(f"a scan of {self.sectors} sectors: give 8 to 3600")
-        if not (0 <= self.range_min_m < self.range_max_m <= 100 and self.origin_m[2] > 0):
+        if not (8 <= self.sectors <= 3600 and self.min_points >= 1):
+            raise UsageError(
+                f"a scan of {self.sectors} sectors from {self.min_points} points: give 8 to 3600, and 1 or more"
+            )
+        if not (0 <= self.range_min_m < self.range_max_m <= 100 and 0 < self.origin_m[2] < math.inf):
             raise UsageError(
                 f"a scan from {self.range_min_m} m to {self.range_max_m} m, {self.origin_m[2]} m above the ground: "
                 "0 <= range_min_m < range_max_m <= 100, and above 0"
@@ -108,6 +117,8 @@ class ScanOptions:
                 f"obstacles from {self.min_obstacle_height} m to {self.max_obstacle_height} m, steps of {self.step_m} m"
                 ": 0 < step_m <= min_obstacle_height < max_obstacle_height"
             )
+        if not (math.isfinite(self.origin_m[0]) and math.isfinite(self.origin_m[1])):
+            raise UsageError(f"a scanner at {self.origin_m} m: give finite numbers")
         if not all(0 < angle < 1.5 for angle in (self.max_slope_rad, self.max_rise_rad, self.max_fall_rad)):
             raise UsageError("max_slope_rad, max_rise_rad and max_fall_rad lie between 0 and 1.5")
 
@@ -174,9 +185,17 @@ def obstacle_scan(cloud: Cloud, options: ScanOptions) -> ObstacleScan | Refused:
     finite = np.isfinite(points).all(axis=1)
     if not finite.any() or not math.isfinite(cloud.stamp_s):
         return Refused(Unusable.NOT_FINITE, f"a cloud of {len(points)} points, none of them finite, or without a time")
-    return _Reading(points[finite] - np.array(options.origin_m, np.float32), _level(cloud, options), options).scan(
-        cloud.stamp_s
-    )
+    points = points[finite] - np.array(options.origin_m, np.float32)
+    with np.errstate(over="ignore"):
+        ranges_m = np.sqrt(points[:, 0] * points[:, 0] + points[:, 1] * points[:, 1])
+    used = (ranges_m >= options.range_min_m) & (ranges_m <= _MOST_M) & (np.abs(points[:, 2]) <= _MOST_M)
+    if np.count_nonzero(used) < options.min_points:
+        return Refused(
+            Unusable.TOO_FEW,
+            f"a cloud of {np.count_nonzero(used)} points of the surroundings: {options.min_points} are the least; "
+            "see whether the scanner is covered",
+        )
+    return _Reading(points[used], ranges_m[used], _level(cloud, options), options).scan(cloud.stamp_s)
 
 
 def planar_scan(
@@ -191,7 +210,7 @@ def planar_scan(
         return Refused(Unusable.SHAPE, f"a scan of {ranges.shape} ranges, {angles.shape} angles: give as many of each")
     if not len(ranges):
         return Refused(Unusable.EMPTY, "a scan without ranges")
-    used = np.isfinite(angles) & (ranges >= options.range_min_m)
+    used = (np.abs(angles) <= MOST_RAD) & (ranges >= options.range_min_m)  # and no NaN
     if not used.any() or not math.isfinite(stamp_s):
         return Refused(Unusable.NOT_FINITE, f"a scan of {len(ranges)} ranges of which none says anything")
     ranges, angles = ranges[used], angles[used]
@@ -217,7 +236,10 @@ def _columns(points: NDArray[Any]) -> NDArray[np.float32] | Refused:
         missing = [name for name in ("x", "y", "z") if name not in points.dtype.names]
         if missing:
             return Refused(Unusable.FIELDS, f"a cloud without the field {missing[0]}: it has {points.dtype.names}")
-        points = np.stack([points[name].reshape(-1) for name in ("x", "y", "z")], axis=1)
+        columns = [points[name].reshape(-1) for name in ("x", "y", "z")]
+        if any(column.dtype.kind not in "fiu" or len(column) != points.size for column in columns):
+            return Refused(Unusable.SHAPE, f"a cloud of {points.dtype}: x, y and z are a number each")
+        points = np.stack(columns, axis=1)
     if points.dtype.kind not in "fiu" or points.ndim != 2 or points.shape[1] < 3:
         return Refused(Unusable.SHAPE, f"a cloud of {points.shape} {points.dtype}: give rows of x, y, z")
     if not len(points):
@@ -246,16 +268,19 @@ def _sectors(bearings_rad: NDArray[np.floating[Any]], sectors: int) -> Indices:
 class _Reading:
     """One cloud, (n, 3) from the scanner on: its walks outwards, all bearings at once."""
 
-    def __init__(self, points: NDArray[np.float32], level: NDArray[np.float32], options: ScanOptions) -> None:
+    def __init__(
+        self,
+        points: NDArray[np.float32],
+        ranges_m: NDArray[np.float32],
+        level: NDArray[np.float32],
+        options: ScanOptions,
+    ) -> None:
         self._options = options
         self._level = level
         self._height_m = options.origin_m[2]
         self._bins_m = bin_edges_m(options.range_max_m)
         self._shape = len(self._bins_m) - 1, options.sectors
-        with np.errstate(over="ignore"):
-            ranges = np.sqrt(points[:, 0] * points[:, 0] + points[:, 1] * points[:, 1])
-        used = (ranges >= options.range_min_m) & (ranges <= 1e4)
-        points, self._r = points[used], ranges[used]
+        self._r = ranges_m
         self._x, self._y, self._z = points[:, 0], points[:, 1], points[:, 2] + np.float32(self._height_m)
         self._sector = _sectors(np.arctan2(self._y, self._x), options.sectors)
         fine = np.arange(math.ceil(options.range_max_m / _FINE_M) + 1) * _FINE_M + 1e-6

@@ -143,7 +143,12 @@ def test_a_cloud_of_another_frame_is_none() -> None:
 
 @pytest.mark.parametrize(
     ("points", "reason"),
-    [(np.empty((0, 3)), "empty"), (np.full((9, 3), np.nan), "not_finite"), (np.zeros((9, 2)), "shape")],
+    [
+        (np.empty((0, 3)), "empty"),
+        (np.full((9, 3), np.nan), "not_finite"),
+        (np.zeros((9, 2)), "shape"),
+        (np.zeros((999, 3)), "too_few"),
+    ],
 )
 def test_clouds_that_are_none_are_counted_and_it_stands(points: np.ndarray[Any, Any], reason: str) -> None:
     one = navigator()

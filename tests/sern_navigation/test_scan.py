@@ -213,12 +213,19 @@ def test_the_scanner_need_not_be_in_the_middle() -> None:
         (np.full((10, 3), np.nan), Unusable.NOT_FINITE),
         (np.full((10, 3), np.inf), Unusable.NOT_FINITE),
         (np.full((10, 3), 1e300), Unusable.NOT_FINITE),
+        (np.zeros((100, 3)), Unusable.TOO_FEW),
+        (np.eye(3), Unusable.TOO_FEW),
+        (np.full((100, 3), 3e38), Unusable.TOO_FEW),
         (np.zeros((10, 2)), Unusable.SHAPE),
         (np.zeros(10), Unusable.SHAPE),
         (np.zeros((4, 4, 4)), Unusable.SHAPE),
         (np.array([["a", "b", "c"]]), Unusable.SHAPE),
         (np.zeros((3, 3), np.complex128), Unusable.SHAPE),
         (np.zeros(5, [("x", "<f4"), ("y", "<f4")]), Unusable.FIELDS),
+        (np.zeros(5, [("x", "<f4"), ("y", "<f4"), ("z", "<f4", (2,))]), Unusable.SHAPE),
+        (np.zeros(5, [("x", "<f4"), ("y", "<f4"), ("z", "U3")]), Unusable.SHAPE),
+        (np.zeros((5, 3), np.bool_), Unusable.SHAPE),
+        (np.full((5, 3), None), Unusable.SHAPE),
         (np.zeros(0, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]), Unusable.EMPTY),
     ],
 )  # fmt: skip
@@ -249,11 +256,11 @@ def test_any_points_make_a_scan_or_a_reason(seed: int) -> None:
     """Random numbers of any size, with holes: what comes out has its shape, and no NaN."""
     random = np.random.default_rng(seed)
     scale = 10.0 ** random.integers(-3, 12)
-    points = random.normal(0, scale, (int(random.integers(1, 400)), int(random.integers(3, 6))))
+    points = random.normal(0, scale, (int(random.integers(1, 900)), int(random.integers(3, 6))))
     points[random.random(points.shape) < 0.1] = random.choice([np.nan, np.inf, -np.inf])
     found = obstacle_scan(Cloud(points, 0.0), OPTIONS)
     if isinstance(found, Refused):
-        assert found.reason is Unusable.NOT_FINITE
+        assert found.reason in (Unusable.NOT_FINITE, Unusable.TOO_FEW)
         return
     assert found.ranges_m.shape == (360,) and not np.isnan(found.ranges_m).any()
     assert (found.ranges_m >= OPTIONS.range_min_m).all()
@@ -283,6 +290,7 @@ def test_a_planar_scan_is_one_as_well() -> None:
         ([], [], Unusable.EMPTY),
         ([math.nan, -1.0], [0.0, 1.0], Unusable.NOT_FINITE),
         ([1.0], [math.nan], Unusable.NOT_FINITE),
+        ([1.0], [1e300], Unusable.NOT_FINITE),
     ],
 )
 def test_a_planar_scan_that_is_none_says_why(ranges: list[float], angles: list[float], reason: Unusable) -> None:
@@ -299,7 +307,8 @@ def test_bins_reach_as_far_as_a_scan(range_max_m: float) -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        {"sectors": 2}, {"range_min_m": 11.0}, {"range_max_m": math.nan}, {"origin_m": (0.0, 0.0, 0.0)},
+        {"sectors": 2}, {"min_points": 0}, {"range_min_m": 11.0}, {"range_max_m": math.nan},
+        {"origin_m": (0.0, 0.0, 0.0)}, {"origin_m": (math.nan, 0.0, 0.4)},
         {"min_obstacle_height": 3.0}, {"step_m": 0.0}, {"step_m": 0.5}, {"max_slope_rad": 2.0}, {"max_fall_rad": 0.0},
     ],
 )  # fmt: skip
