@@ -46,7 +46,7 @@ def test_on_hills_it_drives_around_a_parked_car_too() -> None:
     car = [block for block in robot.world.blocks if block.label is Label.CAR]
     for _ in range(450):
         state = robot.state
-        points = robot.cloud(5_760)[:, :3].astype(np.float64) + [0.0, 0.0, LIDAR_HEIGHT_M]
+        points = robot.cloud(5_760)[:, :3].astype(np.float64) + np.array([0.0, 0.0, LIDAR_HEIGHT_M])
         cloud = Cloud(points, state.time_s, roll_rad=state.roll_rad, pitch_rad=state.pitch_rad)
         command = navigator.step(state.time_s, (state.pose.x_m, state.pose.y_m, state.pose.yaw_rad), cloud)
         if command.status.state is not State.FOLLOWING:
