@@ -37,6 +37,8 @@ from sern_twin.world.occupancy import MOST_M, MOST_RAD, Pose
 from sern_twin.world.patches import Cells
 
 _MARGIN_M: Final = 0.5
+_MOST_SPEED: Final = 100.0
+"""[m/s, rad/s]: no robot has more."""
 _LEAST_BETWEEN_PLANS_S: Final = 0.3
 """A path that something comes to lie on is not planned anew more often."""
 
@@ -85,6 +87,7 @@ class Unused(StrEnum):
     TIME = "time"
     """It is not finite, or before the last: all of that step."""
     SPEED = "speed"
+    """It is not finite, or that of no robot."""
 
 
 _HOPELESS: Final = frozenset({Code.START_OUTSIDE_MAP, Code.GOAL_OUTSIDE_MAP, Code.GOAL_OCCUPIED})
@@ -268,7 +271,7 @@ class Navigator:
         self._see(now_s, pose, scan)
         if twin is not None and self.costmap.twin.take(twin) is not MapOutcome.TAKEN:
             self._unused[Unused.TWIN] += 1
-        if speed is not None and not (math.isfinite(speed[0]) and math.isfinite(speed[1])):
+        if speed is not None and not (abs(speed[0]) <= _MOST_SPEED and abs(speed[1]) <= _MOST_SPEED):  # and no NaN
             self._unused[Unused.SPEED] += 1
             speed = None
         wanted, trajectory = self._wanted(now_s, pose, speed or self._speed)

@@ -397,7 +397,7 @@ class _Reading:
             ray = (self._height_m - low_z) / low_r
             ahead = (self._height_m - at_z + slope * at_r) / (slope + ray)
             edges = np.maximum((at_r + ahead) / 2, ahead - _BEFORE_M)
-        return np.maximum(edges, self._options.range_min_m).astype(np.float64)
+        return np.maximum(edges.astype(np.float64), self._options.range_min_m)
 
     def _missing(self, ground: "_Ground", ranges_m: Floats) -> Floats:
         """Where ground is missing, (sectors,): two rings that should meet it meet nothing, and all below them do.

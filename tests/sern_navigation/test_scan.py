@@ -263,7 +263,7 @@ def test_any_points_make_a_scan_or_a_reason(seed: int) -> None:
         assert found.reason in (Unusable.NOT_FINITE, Unusable.TOO_FEW)
         return
     assert found.ranges_m.shape == (360,) and not np.isnan(found.ranges_m).any()
-    assert (found.ranges_m >= OPTIONS.range_min_m).all()
+    assert (found.ranges_m >= OPTIONS.range_min_m - 1e-6).all()
     assert np.isfinite(found.points_m).all() and np.isfinite(found.tops_m).all()
     assert not np.isnan(found.lowest_m).any() and (found.lowest_m >= 0).all()
 
