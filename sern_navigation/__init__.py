@@ -12,4 +12,5 @@ recovery           what a robot tries that is stuck
 navigator          a goal, and the command of each cycle until it is reached or given up
 
 Parameters that Nav2 has are called as in Nav2 and mean the same; units are metres, seconds and radians throughout.
+It needs the extra `twin`, for scipy.
 """

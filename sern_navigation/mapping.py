@@ -9,7 +9,7 @@ import numpy as np
 
 from sern_core.vocabulary.errors import UsageError
 from sern_navigation.matching import Match, MatchOptions, NoMatch, match
-from sern_navigation.scan import ObstacleScan
+from sern_navigation.scan import ObstacleScan, turned
 from sern_twin.world.grid import Floats, Grid
 from sern_twin.world.occupancy import Occupancy, OccupancyOptions, Pose
 from sern_twin.world.patches import UNKNOWN
@@ -90,15 +90,14 @@ class Mapper:
         return mapped
 
     def _lay(self, pose: Pose, scan: ObstacleScan) -> None:
-        cos, sin = np.cos(pose[2]), np.sin(pose[2])
-        forward, left = scan.origin_m
-        scanner = float(pose[0] + cos * forward - sin * left), float(pose[1] + sin * forward + cos * left), pose[2]
+        forward_m, left_m = turned(np.array(scan.origin_m), pose[2]).tolist()
+        scanner = pose[0] + forward_m, pose[1] + left_m, pose[2]
         furthest_m = float(scan.bins_m[-1])
         stands = np.isfinite(scan.ranges_m) & ~scan.drops
         if stands.any():
             self.occupancy.fuse(scanner, scan.bearings_rad[stands], scan.ranges_m[stands], furthest_m + 1)
         open_m = min(self._options.free_m, furthest_m)
-        free = ~np.isfinite(scan.ranges_m) & (scan.ground_m >= open_m)
+        free = ~np.isfinite(scan.ranges_m) & (scan.ground_m[:, 1] >= open_m)
         if free.any():
             self.occupancy.fuse(scanner, scan.bearings_rad[free], np.full(int(free.sum()), np.inf), open_m)
 

@@ -138,7 +138,7 @@ class Mppi:
         goal: tuple[float, float, float | None],
         costmap: Costmap,
     ) -> Control:
-        """The command for the next period. `path_m` (n, 2) is the whole path. All of pose and speed is finite."""
+        """The command for the next period. `path_m` (n, 2) is the whole path. Pose and speed are those of a robot."""
         options = self.options
         if not len(path_m):
             return _none(ControlCode.INVALID_PATH, "the path has no points")
@@ -156,7 +156,12 @@ class Mppi:
         return _none(ControlCode.NO_VALID_CONTROL, "every trajectory that was tried meets an obstacle")
 
     def _given(self, best: Floats, trajectory: Floats) -> Control:
-        command = float(best[0, 0]), float(best[0, 1])
+        options = self.options
+        # One that is faster than it may be slows down as its brakes allow; it is told no more than the limits.
+        command = (
+            min(max(float(best[0, 0]), options.vx_min), options.vx_max),
+            min(max(float(best[0, 1]), -options.wz_max), options.wz_max),
+        )
         self._controls = best
         self._history.append(command)
         if self._shifts:

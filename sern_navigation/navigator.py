@@ -31,13 +31,15 @@ from sern_navigation.costmap.twin import TwinView
 from sern_navigation.global_plan import Plan, PlanCode, PlannerOptions, plan
 from sern_navigation.mppi import ControlCode, Mppi, MppiOptions, pruned
 from sern_navigation.recovery import Behaviour, Progress, Recovery, RecoveryOptions
-from sern_navigation.scan import Cloud, ObstacleScan, Refused, ScanOptions, obstacle_scan
+from sern_navigation.scan import Cloud, ObstacleScan, Refused, ScanOptions, obstacle_scan, turned
 from sern_twin.motion import MOST_M
 from sern_twin.world.grid import NOWHERE, Floats, Grid
 from sern_twin.world.occupancy import MOST_RAD, Pose
 from sern_twin.world.patches import Cells
 
 _MARGIN_M: Final = 0.5
+_MOST_SPEED: Final = 100.0
+"""[m/s, rad/s]: no robot has more."""
 _LEAST_BETWEEN_PLANS_S: Final = 0.3
 """A path that something comes to lie on is not planned anew more often."""
 
@@ -86,6 +88,7 @@ class Unused(StrEnum):
     TIME = "time"
     """It is not finite, or before the last: all of that step."""
     SPEED = "speed"
+    """It is not finite, or that of no robot."""
 
 
 _HOPELESS: Final = frozenset({Code.START_OUTSIDE_MAP, Code.GOAL_OUTSIDE_MAP, Code.GOAL_OCCUPIED})
@@ -190,6 +193,7 @@ class Navigator:
         self._goal: Goal | None = None
         self._scan_s: float | None = None
         self._scan_points: Floats = _NO_PATH
+        self._scan_pose: Pose | None = None
         self._complaint = ""
         self._now_s = -math.inf
         self._speed: Speed = STOPPED
@@ -252,9 +256,11 @@ class Navigator:
         *,
         speed: Speed | None = None,
     ) -> Command:
-        """The command of this cycle. `speed`: what the robot measures of itself; None: what it was told last.
+        """The command of this cycle. `speed`: what the robot measures of itself; None: what it was told last, as with
+        Nav2's open_loop.
 
-        The scan is of the robot where `pose` has it. It is given once; without one the last one ages.
+        The scan is of the robot where `pose` has it. It is given once; without one the last one ages. Time does not go
+        back. A step in which the path is planned anew takes as long as `global_plan.plan` more.
         """
         if not (math.isfinite(now_s) and now_s >= self._now_s):
             self._unused[Unused.TIME] += 1
@@ -266,15 +272,11 @@ class Navigator:
         self._see(now_s, pose, scan)
         if twin is not None and self.costmap.twin.take(twin) is not MapOutcome.TAKEN:
             self._unused[Unused.TWIN] += 1
-        if speed is not None and not (math.isfinite(speed[0]) and math.isfinite(speed[1])):
+        if speed is not None and not (abs(speed[0]) <= _MOST_SPEED and abs(speed[1]) <= _MOST_SPEED):  # and no NaN
             self._unused[Unused.SPEED] += 1
             speed = None
         wanted, trajectory = self._wanted(now_s, pose, speed or self._speed)
-        points = self._scan_points
-        if pose is not None:
-            near = self.costmap.obstacles.marks_near(pose, self.options.local_radius_m)
-            points = np.concatenate((points, near))
-        verdict = self.monitor.process(wanted, points, self._scan_s, now_s)
+        verdict = self.monitor.process(wanted, self._real_points(pose), self._scan_s, now_s)
         self._speed = verdict.command
         return self._command(wanted, trajectory, verdict)
 
@@ -293,9 +295,21 @@ class Navigator:
             self._unused[Unused.SCAN_LATE] += 1
             self._complaint = f"a scan of {now_s - found.stamp_s:.1f} s ago is too old, or from the future"
             return
-        self._scan_s, self._scan_points, self._complaint = found.stamp_s, found.points_m, ""
+        self._scan_s, self._scan_points, self._scan_pose = found.stamp_s, found.points_m, pose
+        self._complaint = ""
         if pose is not None:
             self.costmap.obstacles.observe(pose, found)
+
+    def _real_points(self, pose: Pose | None) -> Floats:
+        """What real sensors have seen, (n, 2) in the robot's frame as it is now: the last scan and all marks."""
+        if pose is None:
+            return self._scan_points
+        points = self._scan_points
+        if self._scan_pose is not None and self._scan_pose != pose:
+            x_m, y_m, yaw_rad = self._scan_pose
+            to_x_m, to_y_m = turned(np.array([x_m - pose[0], y_m - pose[1]]), -pose[2]).tolist()
+            points = turned(points, yaw_rad - pose[2]) + np.array([to_x_m, to_y_m])
+        return np.concatenate((points, self.costmap.obstacles.marks_near(pose, self.options.local_radius_m)))
 
     def _sees(self, now_s: float) -> bool:
         return self._scan_s is not None and abs(now_s - self._scan_s) <= self.options.monitor.source_timeout

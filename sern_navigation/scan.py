@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sern_core.vocabulary.errors import UsageError
 from sern_twin.world.grid import Floats
+from sern_twin.world.occupancy import MOST_RAD
 
 Indices = NDArray[np.intp]
 
@@ -26,7 +27,12 @@ MOST_POINTS: Final = 1_000_000
 VLP16_RAD: Final = tuple(math.radians(degrees) for degrees in range(-15, 16, 2))
 """Elevations of the 16 rings that Velodyne's VLP-16 and the simulated robot have."""
 _FINE_M: Final = 0.05
+_BEFORE_M: Final = 0.12
+"""An edge is said to be so far before a hole that is sure: rays are a quarter of a metre apart where it matters."""
 _TURN: Final = 2 * math.pi
+_MOST_TILT_RAD: Final = 0.7
+_MOST_M: Final = 1e4
+"""Nothing is so far away, and its square is a number still."""
 
 
 class Unusable(StrEnum):
@@ -38,6 +44,8 @@ class Unusable(StrEnum):
     EMPTY = "empty"
     NOT_FINITE = "not_finite"
     """No point of it has three finite numbers, or its time is none."""
+    TOO_FEW = "too_few"
+    """Fewer than `min_points` are of its surroundings: the scanner is covered, or sees the robot alone."""
     TOO_LARGE = "too_large"
     OTHER_FRAME = "other_frame"
 
@@ -46,12 +54,16 @@ class Unusable(StrEnum):
 class Cloud:
     """Points of one turn of a scanner in the robot's own frame: x forward, y left, z up from the ground below it [m].
 
-    `points_m` is (n, 3) or wider, or an array with fields x, y and z. Missing returns are NaN.
+    `points_m` is (n, 3) or wider, or an array with fields x, y and z. Missing returns are NaN. Roll and pitch (REP 103:
+    nose down is positive) are those of the robot, where they are known: one with its front wheels on a step looks up,
+    and level ground ahead of it seems to fall.
     """
 
     points_m: NDArray[Any]
     stamp_s: float
     frame_id: str = "base_link"
+    roll_rad: float = 0.0
+    pitch_rad: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,15 +85,17 @@ class ScanOptions:
     range_min_m: float = 0.35
     """What is nearer is the robot itself."""
     range_max_m: float = 10.0
+    min_points: int = 30
+    """A cloud of fewer is none."""
     min_obstacle_height: float = 0.10
     max_obstacle_height: float = 2.0
     """[m] above the ground, where Nav2 has them above the frame's zero."""
     max_slope_rad: float = 0.35
     max_rise_rad: float = 0.26
     """How much steeper than the ground before it ground may be."""
-    max_fall_rad: float = 0.13
+    max_fall_rad: float = 0.17
     """The same downwards, up to `drop_range_m`: behind an edge the next ray meets ground far away, little lower. Ground
-    that falls half as much and then rises steeply is a ditch."""
+    that falls a third as much and then rises steeply is a ditch."""
     step_m: float = 0.06
     """A step up that is driven over, and half as much more downwards."""
     drop_range_m: float = 4.0
@@ -89,9 +103,11 @@ class ScanOptions:
     """Rings that meet the ground within `drop_range_m` must be there. None: missing ground is not looked for."""
 
     def __post_init__(self) -> None:
-        if not 8 <= self.sectors <= 3600:
-            raise UsageError(f"a scan of {self.sectors} sectors: give 8 to 3600")
-        if not (0 <= self.range_min_m < self.range_max_m <= 100 and self.origin_m[2] > 0):
+        if not (8 <= self.sectors <= 3600 and self.min_points >= 1):
+            raise UsageError(
+                f"a scan of {self.sectors} sectors from {self.min_points} points: give 8 to 3600, and 1 or more"
+            )
+        if not (0 <= self.range_min_m < self.range_max_m <= 100 and 0 < self.origin_m[2] < math.inf):
             raise UsageError(
                 f"a scan from {self.range_min_m} m to {self.range_max_m} m, {self.origin_m[2]} m above the ground: "
                 "0 <= range_min_m < range_max_m <= 100, and above 0"
@@ -101,6 +117,8 @@ class ScanOptions:
                 f"obstacles from {self.min_obstacle_height} m to {self.max_obstacle_height} m, steps of {self.step_m} m"
                 ": 0 < step_m <= min_obstacle_height < max_obstacle_height"
             )
+        if not (math.isfinite(self.origin_m[0]) and math.isfinite(self.origin_m[1])):
+            raise UsageError(f"a scanner at {self.origin_m} m: give finite numbers")
         if not all(0 < angle < 1.5 for angle in (self.max_slope_rad, self.max_rise_rad, self.max_fall_rad)):
             raise UsageError("max_slope_rad, max_rise_rad and max_fall_rad lie between 0 and 1.5")
 
@@ -110,9 +128,10 @@ class ObstacleScan:
     """What a scan says of its surroundings, in bearings from the scanner, counter-clockwise from -π.
 
     `ranges_m` (sectors,): S_2D, the nearest obstacle or edge; inf where none is. `drops` (sectors,): it is an edge.
-    `ground_m` (sectors,): how far ground was seen; 0 where nothing was. `points_m` (n, 2): all obstacles and edges in
-    the robot's frame; `tops_m` (n,): how high above the ground they reach. `lowest_m` (bins, sectors): how low the
-    lowest ray passed above the ground; inf where none did. `bins_m` (bins + 1,): the edges of the bins.
+    `ground_m` (sectors, 2): from where to where ground was seen without an edge in it; 0, 0 where it was not.
+    `points_m` (n, 2): all obstacles and edges in the robot's frame; `tops_m` (n,): how high they reach above
+    the ground, 0 for edges. `lowest_m` (bins, sectors): how low the lowest ray passed above the ground; inf where none
+    did. `bins_m` (bins + 1,): where the bins begin and end.
     """
 
     stamp_s: float
@@ -134,6 +153,13 @@ class ObstacleScan:
 def middles(sectors: int) -> Floats:
     """The bearings of the middles of so many sectors, from -π on."""
     found: Floats = (np.arange(sectors, dtype=np.float64) + 0.5) * (_TURN / sectors) - math.pi
+    return found
+
+
+def turned(points: Floats, yaw_rad: float) -> Floats:
+    """Points (..., 2) turned about the origin, counter-clockwise."""
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    found: Floats = points @ np.array([[cos, sin], [-sin, cos]])
     return found
 
 
@@ -159,7 +185,17 @@ def obstacle_scan(cloud: Cloud, options: ScanOptions) -> ObstacleScan | Refused:
     finite = np.isfinite(points).all(axis=1)
     if not finite.any() or not math.isfinite(cloud.stamp_s):
         return Refused(Unusable.NOT_FINITE, f"a cloud of {len(points)} points, none of them finite, or without a time")
-    return _Reading(points[finite] - np.array(options.origin_m, np.float32), options).scan(cloud.stamp_s)
+    points = points[finite] - np.array(options.origin_m, np.float32)
+    with np.errstate(over="ignore"):
+        ranges_m = np.sqrt(points[:, 0] * points[:, 0] + points[:, 1] * points[:, 1])
+    used = (ranges_m >= options.range_min_m) & (ranges_m <= _MOST_M) & (np.abs(points[:, 2]) <= _MOST_M)
+    if np.count_nonzero(used) < options.min_points:
+        return Refused(
+            Unusable.TOO_FEW,
+            f"a cloud of {np.count_nonzero(used)} points of the surroundings: {options.min_points} are the least; "
+            "see whether the scanner is covered",
+        )
+    return _Reading(points[used], ranges_m[used], _level(cloud, options), options).scan(cloud.stamp_s)
 
 
 def planar_scan(
@@ -174,7 +210,7 @@ def planar_scan(
         return Refused(Unusable.SHAPE, f"a scan of {ranges.shape} ranges, {angles.shape} angles: give as many of each")
     if not len(ranges):
         return Refused(Unusable.EMPTY, "a scan without ranges")
-    used = np.isfinite(angles) & (ranges >= options.range_min_m)
+    used = (np.abs(angles) <= MOST_RAD) & (ranges >= options.range_min_m)  # and no NaN
     if not used.any() or not math.isfinite(stamp_s):
         return Refused(Unusable.NOT_FINITE, f"a scan of {len(ranges)} ranges of which none says anything")
     ranges, angles = ranges[used], angles[used]
@@ -191,7 +227,8 @@ def planar_scan(
     points = ranges[ends, None] * directions + options.origin_m[:2]
     tops = np.full(len(points), options.origin_m[2])
     no_drops = np.zeros(options.sectors, np.bool_)
-    return ObstacleScan(stamp_s, options.origin_m[:2], nearest, no_drops, seen_m, points, tops, lowest, bins_m)
+    ground = np.stack((np.zeros(options.sectors), seen_m), axis=1)
+    return ObstacleScan(stamp_s, options.origin_m[:2], nearest, no_drops, ground, points, tops, lowest, bins_m)
 
 
 def _columns(points: NDArray[Any]) -> NDArray[np.float32] | Refused:
@@ -199,7 +236,10 @@ def _columns(points: NDArray[Any]) -> NDArray[np.float32] | Refused:
         missing = [name for name in ("x", "y", "z") if name not in points.dtype.names]
         if missing:
             return Refused(Unusable.FIELDS, f"a cloud without the field {missing[0]}: it has {points.dtype.names}")
-        points = np.stack([points[name].reshape(-1) for name in ("x", "y", "z")], axis=1)
+        columns = [points[name].reshape(-1) for name in ("x", "y", "z")]
+        if any(column.dtype.kind not in "fiu" or len(column) != points.size for column in columns):
+            return Refused(Unusable.SHAPE, f"a cloud of {points.dtype}: x, y and z are a number each")
+        points = np.stack(columns, axis=1)
     if points.dtype.kind not in "fiu" or points.ndim != 2 or points.shape[1] < 3:
         return Refused(Unusable.SHAPE, f"a cloud of {points.shape} {points.dtype}: give rows of x, y, z")
     if not len(points):
@@ -210,6 +250,16 @@ def _columns(points: NDArray[Any]) -> NDArray[np.float32] | Refused:
         return points[:, :3].astype(np.float32)
 
 
+def _level(cloud: Cloud, options: ScanOptions) -> NDArray[np.float32]:
+    """How level ground rises in the robot's frame at each bearing, (sectors,); none where its attitude is no use."""
+    roll, pitch = cloud.roll_rad, cloud.pitch_rad
+    if not (abs(roll) <= _MOST_TILT_RAD and abs(pitch) <= _MOST_TILT_RAD):  # and no NaN
+        return np.zeros(options.sectors, np.float32)
+    bearings = middles(options.sectors)
+    rise = math.tan(pitch) / math.cos(roll) * np.cos(bearings) - math.tan(roll) * np.sin(bearings)
+    return rise.astype(np.float32)
+
+
 def _sectors(bearings_rad: NDArray[np.floating[Any]], sectors: int) -> Indices:
     found: Indices = np.floor((bearings_rad + math.pi) * (sectors / _TURN)).astype(np.intp) % sectors
     return found
@@ -218,15 +268,19 @@ def _sectors(bearings_rad: NDArray[np.floating[Any]], sectors: int) -> Indices:
 class _Reading:
     """One cloud, (n, 3) from the scanner on: its walks outwards, all bearings at once."""
 
-    def __init__(self, points: NDArray[np.float32], options: ScanOptions) -> None:
+    def __init__(
+        self,
+        points: NDArray[np.float32],
+        ranges_m: NDArray[np.float32],
+        level: NDArray[np.float32],
+        options: ScanOptions,
+    ) -> None:
         self._options = options
+        self._level = level
         self._height_m = options.origin_m[2]
         self._bins_m = bin_edges_m(options.range_max_m)
         self._shape = len(self._bins_m) - 1, options.sectors
-        with np.errstate(over="ignore"):
-            ranges = np.sqrt(points[:, 0] * points[:, 0] + points[:, 1] * points[:, 1])
-        used = (ranges >= options.range_min_m) & (ranges <= 1e4)
-        points, self._r = points[used], ranges[used]
+        self._r = ranges_m
         self._x, self._y, self._z = points[:, 0], points[:, 1], points[:, 2] + np.float32(self._height_m)
         self._sector = _sectors(np.arctan2(self._y, self._x), options.sectors)
         fine = np.arange(math.ceil(options.range_max_m / _FINE_M) + 1) * _FINE_M + 1e-6
@@ -251,14 +305,13 @@ class _Reading:
         bearings = middles(options.sectors)[at_edge]
         edge_points = edges_m[at_edge, None] * np.stack((np.cos(bearings), np.sin(bearings)), axis=1)
         points_m = np.concatenate((points_m, edge_points)) + options.origin_m[:2]
-        tops_m = np.concatenate((tops_m, np.full(len(edge_points), options.min_obstacle_height)))
-        seen = np.where(ground.seen, self._bins_m[1:, None], 0.0).max(axis=0)
+        tops_m = np.concatenate((tops_m, np.zeros(len(edge_points))))
         return ObstacleScan(
             stamp_s,
             options.origin_m[:2],
             np.minimum(ranges_m, edges_m),
             at_edge,
-            seen,
+            self._extent(ground, edges_m),
             points_m,
             tops_m,
             self._lowest(ground),
@@ -287,13 +340,16 @@ class _Reading:
                 along = np.maximum(low_r[number] - at_r, np.float32(1e-3))
                 up = np.where(there, low_z[number] - at_z, 0)
                 tilt = up / along
-                bend = tilt - slope
+                # At first it goes on as the robot stands, or level, whichever is nearer to what is seen.
+                first = np.where(np.abs(tilt - self._level) < np.abs(tilt), self._level, 0)
+                before = np.where(at_r > 0, slope, first)
+                bend = tilt - before
                 too_steep = (up > options.step_m) & ((tilt > steepest) | (bend > rise))
                 sunk = bend * along < -1.5 * options.step_m
                 falls = sunk & ((tilt < -steepest) | ((bend < -fall) & (at_r <= options.drop_range_m)))
-                dips = sunk & (bend < -fall / 2) & (at_r <= options.drop_range_m)
+                dips = sunk & (bend < -fall / 3) & (at_r <= options.drop_range_m)
                 if dips.any() or falls.any():
-                    edges_m = self._edges_m(at_r, at_z, slope, low_r[number], low_z[number])
+                    edges_m = self._edges_m(at_r, at_z, before, low_r[number], low_z[number])
                     ground.edges_m[falls] = np.minimum(ground.edges_m, edges_m)[falls]
                     ditch_m = np.where(dips, edges_m, ditch_m)
                 other_side = too_steep | (dips & stands[number])
@@ -303,7 +359,7 @@ class _Reading:
                 at_z = np.where(is_ground, low_z[number], at_z)
                 at_r = np.where(is_ground, low_r[number], at_r)
                 # Two points close to each other say little of a slope.
-                slope = np.where(is_ground, np.clip(tilt, -steepest, steepest) * np.minimum(along / 0.3, 1), slope)
+                slope = np.where(is_ground, np.clip(tilt, -steepest, steepest) * np.minimum(along / 0.2, 1), slope)
                 ground.seen[number] = is_ground
             ground.z_m[number], ground.r_m[number], ground.slope[number] = at_z, at_r, slope
         return ground
@@ -334,13 +390,14 @@ class _Reading:
     ) -> Floats:
         """Where the ground ends that goes on from a place with a slope, if a ray that passes it ends lower.
 
-        The edge lies between the last ground and where the ray goes below it; the middle is the least off.
+        The edge lies between the last ground and where the ray goes below it. The middle is the least off; where the
+        two are far apart it is said late rather than where ground is, and better when the robot is nearer.
         """
         with np.errstate(divide="ignore", invalid="ignore"):
             ray = (self._height_m - low_z) / low_r
             ahead = (self._height_m - at_z + slope * at_r) / (slope + ray)
-            edges = np.maximum((at_r + ahead) / 2, ahead - 0.25)
-        return np.maximum(edges, self._options.range_min_m).astype(np.float64)
+            edges = np.maximum((at_r + ahead) / 2, ahead - _BEFORE_M)
+        return np.maximum(edges.astype(np.float64), self._options.range_min_m)
 
     def _missing(self, ground: "_Ground", ranges_m: Floats) -> Floats:
         """Where ground is missing, (sectors,): two rings that should meet it meet nothing, and all below them do.
@@ -370,6 +427,14 @@ class _Reading:
             gone &= (last_m < meets_m) & (meets_m <= options.drop_range_m) & (meets_m < ranges_m)
             edges_m = np.where(gone, np.minimum(edges_m, (last_m + meets_m) / 2), edges_m)
         return edges_m
+
+    def _extent(self, ground: "_Ground", edges_m: Floats) -> Floats:
+        """From where to where there is ground, (sectors, 2): from the first that was seen on, up to an edge."""
+        starts, ends = self._bins_m[:-1, None], self._bins_m[1:, None]
+        seen = ground.seen & (starts < edges_m)
+        first = np.where(seen, starts, np.inf).min(axis=0)
+        last = np.where(seen, np.minimum(ends, edges_m), 0.0).max(axis=0)
+        return np.stack((np.where(last > 0, first, 0.0), last), axis=1)
 
     def _marks(
         self, key: Indices, over: NDArray[np.float32], x: NDArray[np.float32], y: NDArray[np.float32]

@@ -1,7 +1,8 @@
 """The layer of what real scans see: obstacles are marked, and cleared where a ray passes low enough to have met them.
 
 Nav2's obstacle and voxel layers in 2.5 dimensions: a mark has a height, and a ray that passes above it says nothing of
-it. What is too near to be seen below the lowest ray stays as it was seen from further away.
+it. What is too near to be seen below the lowest ray stays as it was seen from further away. An edge of the ground is
+cleared where ground is seen in its place, and by nothing else.
 """
 
 import math
@@ -12,7 +13,7 @@ import numpy as np
 
 from sern_core.vocabulary.errors import UsageError
 from sern_navigation.costmap.costs import FREE_SPACE, LETHAL_OBSTACLE, NO_INFORMATION, Costs, Mask, Window, around
-from sern_navigation.scan import ObstacleScan
+from sern_navigation.scan import ObstacleScan, turned
 from sern_twin.world.grid import NOWHERE, Floats, Grid
 from sern_twin.world.occupancy import Pose
 
@@ -58,6 +59,7 @@ class ObstacleLayer:
         self._radius_m = robot_radius_m
         self._marked = np.zeros(grid.shape, np.bool_)
         self._free = np.zeros(grid.shape, np.bool_)
+        self._edges = np.zeros(grid.shape, np.bool_)
         self._tops_m = np.zeros(grid.shape, np.float32)
         self._hidden = np.zeros(grid.shape, np.bool_)
         """Near the robot, and so low that no ray of the last scan would have met it."""
@@ -75,16 +77,19 @@ class ObstacleLayer:
     def observe(self, pose: Pose, scan: ObstacleScan) -> None:
         """Take a scan from where the robot is: clear, then mark. All of the pose is finite."""
         x_m, y_m, yaw_rad = pose
-        cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-        left_m, up_m = scan.origin_m
-        self._clear(x_m + cos * left_m - sin * up_m, y_m + sin * left_m + cos * up_m, yaw_rad, scan)
+        forward_m, left_m = turned(np.array(scan.origin_m), yaw_rad).tolist()
+        self._clear(x_m + forward_m, y_m + left_m, yaw_rad, scan)
         self._mark(pose, scan)
         if self.options.footprint_clearing_enabled:
             window = around(self.grid, x_m, y_m, self._radius_m)
             if not window.empty:
-                here = np.hypot(*self._offsets(window, x_m, y_m)) <= self._radius_m
-                self._marked[window.slices] &= ~here
-                self._free[window.slices] |= here
+                away_m = np.hypot(*self._offsets(window, x_m, y_m))
+                here = away_m <= self._radius_m
+                # But an edge may well be where a part of it is; not where its middle is, or it would have fallen.
+                edges = self._edges[window.slices]
+                edges &= away_m > self._radius_m / 2
+                self._marked[window.slices] &= ~here | edges
+                self._free[window.slices] |= here & ~self._marked[window.slices]
 
     def costs(self, window: Window) -> Costs:
         """LETHAL_OBSTACLE, FREE_SPACE or NO_INFORMATION, in the window's shape."""
@@ -97,9 +102,7 @@ class ObstacleLayer:
         window = around(self.grid, x_m, y_m, radius_m)
         rows, columns = np.nonzero(self._marked[window.slices])
         places = self.grid.centres(rows + window.first_row, columns + window.first_column) - [x_m, y_m]
-        cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-        found: Floats = places @ np.array([[cos, -sin], [sin, cos]])
-        return found
+        return turned(places, -yaw_rad)
 
     def clear(self) -> None:
         """Forget all that the next scan would show: Nav2's clearing of the costmap, but for what is near and below
@@ -107,6 +110,7 @@ class ObstacleLayer:
         """
         kept = self._marked & self._hidden
         self._marked[:] = kept
+        self._edges &= kept
         self._free[:] = False
 
     def _offsets(self, window: Window, x_m: float, y_m: float) -> tuple[Floats, Floats]:
@@ -135,8 +139,12 @@ class ObstacleLayer:
             np.float32(np.inf),
         )
         marked, free = self._marked[window.slices], self._free[window.slices]
+        ground = scan.ground_m[sector]
+        is_ground = (ranges >= ground[..., 0]) & (ranges <= ground[..., 1]) & np.isfinite(passed)
         met = passed <= self._tops_m[window.slices] - np.float32(_CLEARLY_M)
+        met = np.where(self._edges[window.slices], is_ground, met)
         marked &= ~met
+        self._edges[window.slices] &= marked
         self._hidden[:] = False
         self._hidden[window.slices] = ~met & (ranges <= _NEAR_M)
         free |= passed <= options.seen_below_m
@@ -147,13 +155,12 @@ class ObstacleLayer:
         ranges = np.hypot(*(scan.points_m - scan.origin_m).T)
         near = (ranges >= options.obstacle_min_range) & (ranges <= options.obstacle_max_range)
         x_m, y_m, yaw_rad = pose
-        cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-        places = scan.points_m[near] @ np.array([[cos, sin], [-sin, cos]]) + [x_m, y_m]
-        cells = self.grid.flat(places)
+        cells = self.grid.flat(turned(scan.points_m[near], yaw_rad) + np.array([x_m, y_m]))
         on_grid = cells != NOWHERE
         cells = cells[on_grid]
-        tops = self._tops_m.reshape(-1)
+        tops, found_m = self._tops_m.reshape(-1), scan.tops_m[near][on_grid].astype(np.float32)
         tops[cells[~self._marked.reshape(-1)[cells]]] = 0.0
-        np.maximum.at(tops, cells, scan.tops_m[near][on_grid].astype(np.float32))
+        np.maximum.at(tops, cells, found_m)
+        self._edges.reshape(-1)[cells[found_m == 0]] = True
         self._marked.reshape(-1)[cells] = True
         self._free.reshape(-1)[cells] = False

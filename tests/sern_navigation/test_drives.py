@@ -1,6 +1,7 @@
 """The whole loop with the simulated robot, its slip and its scanner: around a car, through a gap, to the goal."""
 
 import math
+from random import Random
 
 import numpy as np
 import pytest
@@ -8,6 +9,10 @@ import pytest
 from sern_navigation.collision_monitor import Action
 from sern_navigation.costmap.twin import TwinView
 from sern_navigation.navigator import Code, Goal, Navigator, State
+from sern_navigation.scan import Cloud
+from sern_sim.mujoco_jackal import MujocoJackal
+from sern_sim.robot import LIDAR_HEIGHT_M
+from sern_sim.terrain import Label
 from sern_twin.world.grid import Grid
 from tests.exploring import seeds
 from tests.sern_navigation.worlds import box, drive, filled, jackal, world_of
@@ -30,6 +35,32 @@ def test_it_drives_around_a_parked_car_and_through_a_gap(seed: int) -> None:
     pose = robot.state.pose
     assert math.dist((pose.x_m, pose.y_m), (10.5, 0.0)) < 0.3 and abs(pose.yaw_rad) < 0.3
     assert robot.state.time_s < 45 and commands[-1].speed == (0.0, 0.0)
+
+
+def test_on_hills_it_drives_around_a_parked_car_too() -> None:
+    """In MuJoCo: slopes that are no obstacles, a body that tilts, wheels that skid."""
+    pytest.importorskip("mujoco", reason="the extra sim is not installed")
+    robot = MujocoJackal(Random(3))
+    navigator = Navigator(Grid(-20.0, -20.0, 0.1, 400, 400), np.random.default_rng(0))
+    navigator.go(Goal(12.0, 0.0))
+    car = [block for block in robot.world.blocks if block.label is Label.CAR]
+    for _ in range(450):
+        state = robot.state
+        points = robot.cloud(5_760)[:, :3].astype(np.float64) + np.array([0.0, 0.0, LIDAR_HEIGHT_M])
+        cloud = Cloud(points, state.time_s, roll_rad=state.roll_rad, pitch_rad=state.pitch_rad)
+        command = navigator.step(state.time_s, (state.pose.x_m, state.pose.y_m, state.pose.yaw_rad), cloud)
+        if command.status.state is not State.FOLLOWING:
+            break
+        robot.drive(command.speed[0], command.speed[1] / robot.yaw_scale_known)
+        for _ in range(5):
+            pose = robot.step().pose
+            for block in car:
+                cos, sin = math.cos(block.yaw_rad), math.sin(block.yaw_rad)
+                east_m, north_m = pose.x_m - block.x_m, pose.y_m - block.y_m
+                along_m = max(abs(cos * east_m + sin * north_m) - block.half_m[0], 0.0)
+                beside_m = max(abs(cos * north_m - sin * east_m) - block.half_m[1], 0.0)
+                assert math.hypot(along_m, beside_m) > 0.25
+    assert command.status.state is State.SUCCEEDED and command.status.recoveries == 0, command.status
 
 
 def test_a_twin_that_knows_of_the_car_shows_the_way_around_it() -> None:

@@ -115,6 +115,13 @@ def test_no_command_begins_a_trajectory_into_something(seed: int) -> None:
         pose = moved(pose, speed)
 
 
+def test_a_robot_that_is_too_fast_is_told_no_more_than_the_limits() -> None:
+    control = Mppi(OPTIONS, np.random.default_rng(1)).command(
+        (0.0, 0.0, 0.0), (2.0, -4.0), STRAIGHT, GOAL, costmap_of()
+    )
+    assert control.code is ControlCode.NONE and control.command == (0.5, -1.9)
+
+
 def test_where_all_is_in_the_way_there_is_no_command() -> None:
     """In a box that it would touch wherever it went, at a speed at which it cannot stop."""
     costmap = costmap_of((0.5, -1.0, 0.7, 1.0))

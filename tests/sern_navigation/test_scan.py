@@ -45,15 +45,16 @@ def lifted(where: NDArray[np.bool_], height_m: float) -> Floats:
 def test_nothing_stands_on_level_ground() -> None:
     scan = scan_of(level)
     assert not np.isfinite(scan.ranges_m).any() and not scan.drops.any()
-    assert len(scan.points_m) == 0 and (scan.ground_m > 7.0).all()
+    assert len(scan.points_m) == 0 and (scan.ground_m[:, 1] > 7.0).all() and (scan.ground_m[:, 0] < 1.6).all()
     assert scan.bearings_rad[0] == pytest.approx(-math.pi + math.pi / 360)
 
 
 @pytest.mark.parametrize("degrees", [-10.0, -5.0, 5.0, 10.0])
-def test_a_slope_is_no_obstacle(degrees: float) -> None:
-    """The robot stands on level ground, and the slope begins 1 m ahead."""
+@pytest.mark.parametrize("begins_m", [0.7, 1.0, 1.6, 2.2, 3.0])
+def test_a_slope_is_no_obstacle(degrees: float, begins_m: float) -> None:
+    """The robot stands on level ground, and a slope of 2 m begins somewhere ahead."""
     rise = math.tan(math.radians(degrees))
-    scan = scan_of(lambda x, y: rise * np.maximum(np.hypot(x, y) - 1.0, 0.0))
+    scan = scan_of(lambda x, y: rise * np.clip(np.hypot(x, y) - begins_m, 0.0, 2.0))
     near = scan.ranges_m < 5.0
     assert not near.any(), scan.ranges_m[near]
 
@@ -104,7 +105,35 @@ def test_a_ditch_is_an_edge_before_it_begins(edge_m: float) -> None:
     found = scan.ranges_m[ahead(scan)]
     assert (found < edge_m + 0.3).all() and (found > edge_m - 0.45).all(), found
     assert scan.drops[ahead(scan)].all()
+    assert (scan.ground_m[ahead(scan), 1] <= found).all(), "and ground is said to be there up to it"
     assert not scan.drops[np.abs(scan.bearings_rad) > 2.0].any()
+
+
+@pytest.mark.parametrize(("roll_rad", "pitch_rad"), [(0.0, -0.19), (0.0, 0.19), (0.19, 0.0), (-0.13, -0.15)])
+def test_a_robot_that_stands_askew_on_a_step_sees_that_the_ground_is_level(roll_rad: float, pitch_rad: float) -> None:
+    """Level ground is a plane that is askew in its frame."""
+    forward, left = math.tan(pitch_rad) / math.cos(roll_rad), -math.tan(roll_rad)
+    points = looking_at(lambda x, y: forward * x + left * y)
+    blind = used(obstacle_scan(Cloud(points, 0.0), OPTIONS))
+    assert blind.drops.any(), "otherwise this says nothing"
+    scan = used(obstacle_scan(Cloud(points, 0.0, roll_rad=roll_rad, pitch_rad=pitch_rad), OPTIONS))
+    assert not scan.drops.any() and not (scan.ranges_m < 6.0).any()
+    for wrong in (math.nan, math.inf, 2.0):
+        same = used(obstacle_scan(Cloud(points, 0.0, roll_rad=wrong), OPTIONS))
+        assert (same.ranges_m == blind.ranges_m).all(), "an attitude that is none is not used"
+
+
+@pytest.mark.parametrize("deep_m", [0.2, 0.3, 0.5, 1.0])
+def test_a_step_down_is_an_edge_before_it_is_too_near_to_be_seen(deep_m: float) -> None:
+    """The lowest ray meets the ground 1.49 m ahead. What is seen of a small step from further away is as of a slope."""
+    found = []
+    for edge_m in np.arange(1.5, 1.75, 0.05).tolist():
+        scan = scan_of(lambda x, y, edge_m=edge_m: lifted(x > edge_m, -deep_m))  # type: ignore[misc]
+        seen_m = scan.ranges_m[ahead(scan) & scan.drops]
+        assert seen_m == pytest.approx(edge_m, abs=0.3)
+        assert not (scan.ranges_m[np.abs(scan.bearings_rad) > 2.0] < 6.0).any()
+        found.append(len(seen_m) == np.count_nonzero(ahead(scan)))
+    assert sum(found) >= 3, "from most of these places"
 
 
 def test_a_bridge_over_a_ditch_is_free() -> None:
@@ -184,12 +213,19 @@ def test_the_scanner_need_not_be_in_the_middle() -> None:
         (np.full((10, 3), np.nan), Unusable.NOT_FINITE),
         (np.full((10, 3), np.inf), Unusable.NOT_FINITE),
         (np.full((10, 3), 1e300), Unusable.NOT_FINITE),
+        (np.zeros((100, 3)), Unusable.TOO_FEW),
+        (np.eye(3), Unusable.TOO_FEW),
+        (np.full((100, 3), 3e38), Unusable.TOO_FEW),
         (np.zeros((10, 2)), Unusable.SHAPE),
         (np.zeros(10), Unusable.SHAPE),
         (np.zeros((4, 4, 4)), Unusable.SHAPE),
         (np.array([["a", "b", "c"]]), Unusable.SHAPE),
         (np.zeros((3, 3), np.complex128), Unusable.SHAPE),
         (np.zeros(5, [("x", "<f4"), ("y", "<f4")]), Unusable.FIELDS),
+        (np.zeros(5, [("x", "<f4"), ("y", "<f4"), ("z", "<f4", (2,))]), Unusable.SHAPE),
+        (np.zeros(5, [("x", "<f4"), ("y", "<f4"), ("z", "U3")]), Unusable.SHAPE),
+        (np.zeros((5, 3), np.bool_), Unusable.SHAPE),
+        (np.full((5, 3), None), Unusable.SHAPE),
         (np.zeros(0, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]), Unusable.EMPTY),
     ],
 )  # fmt: skip
@@ -220,14 +256,14 @@ def test_any_points_make_a_scan_or_a_reason(seed: int) -> None:
     """Random numbers of any size, with holes: what comes out has its shape, and no NaN."""
     random = np.random.default_rng(seed)
     scale = 10.0 ** random.integers(-3, 12)
-    points = random.normal(0, scale, (int(random.integers(1, 400)), int(random.integers(3, 6))))
+    points = random.normal(0, scale, (int(random.integers(1, 900)), int(random.integers(3, 6))))
     points[random.random(points.shape) < 0.1] = random.choice([np.nan, np.inf, -np.inf])
     found = obstacle_scan(Cloud(points, 0.0), OPTIONS)
     if isinstance(found, Refused):
-        assert found.reason is Unusable.NOT_FINITE
+        assert found.reason in (Unusable.NOT_FINITE, Unusable.TOO_FEW)
         return
     assert found.ranges_m.shape == (360,) and not np.isnan(found.ranges_m).any()
-    assert (found.ranges_m >= OPTIONS.range_min_m).all()
+    assert (found.ranges_m >= OPTIONS.range_min_m - 1e-6).all()
     assert np.isfinite(found.points_m).all() and np.isfinite(found.tops_m).all()
     assert not np.isnan(found.lowest_m).any() and (found.lowest_m >= 0).all()
 
@@ -254,6 +290,7 @@ def test_a_planar_scan_is_one_as_well() -> None:
         ([], [], Unusable.EMPTY),
         ([math.nan, -1.0], [0.0, 1.0], Unusable.NOT_FINITE),
         ([1.0], [math.nan], Unusable.NOT_FINITE),
+        ([1.0], [1e300], Unusable.NOT_FINITE),
     ],
 )
 def test_a_planar_scan_that_is_none_says_why(ranges: list[float], angles: list[float], reason: Unusable) -> None:
@@ -270,7 +307,8 @@ def test_bins_reach_as_far_as_a_scan(range_max_m: float) -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        {"sectors": 2}, {"range_min_m": 11.0}, {"range_max_m": math.nan}, {"origin_m": (0.0, 0.0, 0.0)},
+        {"sectors": 2}, {"min_points": 0}, {"range_min_m": 11.0}, {"range_max_m": math.nan},
+        {"origin_m": (0.0, 0.0, 0.0)}, {"origin_m": (math.nan, 0.0, 0.4)},
         {"min_obstacle_height": 3.0}, {"step_m": 0.0}, {"step_m": 0.5}, {"max_slope_rad": 2.0}, {"max_fall_rad": 0.0},
     ],
 )  # fmt: skip

@@ -126,7 +126,8 @@ def test_what_is_stale_is_as_if_it_had_not_been_said(seed: int) -> None:
         commands = [step(navigators[0], robots[0], view), step(navigators[1], robots[1], None)]
         assert commands[0].speed == commands[1].speed and commands[0].wanted == commands[1].wanted
         assert (commands[0].trajectory == commands[1].trajectory).all()
-    assert robots[0].state == robots[1].state and robots[0].state.travelled_m > 0.1
+    assert robots[0].state == robots[1].state
+    assert robots[0].state.travelled_m > 0.1 or commands[0].status.state is State.ABORTED, "its goal may be in a thing"
 
 
 def test_what_is_fresh_does_change_a_command() -> None:

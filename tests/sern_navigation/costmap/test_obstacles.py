@@ -110,6 +110,23 @@ def test_an_edge_is_lethal_and_stays_while_one_looks_over_it() -> None:
     assert cost(layer, 3.0, 0.0) != FREE_SPACE, "nobody saw ground in the ditch"
 
 
+def test_an_edge_stays_until_ground_is_seen_in_its_place() -> None:
+    """Beside a robot, where no ray meets the ground; not because of rays above it, nor of the robot that is near."""
+    layer = ObstacleLayer(GRID, FAR)
+    layer.observe((0.0, 0.0, 0.0), scan_of(lambda x, y: np.where((x > 2.0) & (x < 4.0), -2.0, 0.0)))
+    nearer = scan_of(lambda x, y: np.where((x > 0.5) & (x < 2.5), -2.0, 0.0))
+    for _ in range(3):
+        layer.observe((1.5, 0.0, 0.0), nearer)
+        layer.observe((1.5, 0.0, 1.5), nearer)
+        layer.clear()
+    assert marked(layer, 2.0, 0.0)
+    layer.observe((1.7, 0.0, 0.0), nearer)
+    assert marked(layer, 2.0, 0.0)
+    assert cost(layer, 1.7, 0.0) == FREE_SPACE, "its own middle is on firm ground"
+    layer.observe((-0.5, 0.0, 0.0), scan_of(level))
+    assert not marked(layer, 2.0, 0.0), "it was none"
+
+
 def test_nothing_is_where_the_robot_is() -> None:
     layer = ObstacleLayer(GRID, FAR, robot_radius_m=0.33)
     layer.observe((0.0, 0.0, 0.0), scan_of(thing(1.0, 1.0)))
