@@ -15,7 +15,7 @@ from sern_sim.hop import Hop
 from sern_sim.models import LinkModel, RateStep, Window
 from tests.world import SimClient, World, spec
 
-RATE_BPS = 4e6
+RATE_BPS = 2e6
 
 
 def models(*blackouts: Window, loss: float = 0.0) -> tuple[LinkModel, LinkModel]:
@@ -28,7 +28,13 @@ class TwoLanes:
     """A robot that reaches the relay over both lanes, and a site beside the relay."""
 
     def __init__(
-        self, *, stream: LinkModel, datagrams: LinkModel, open_at_s: float = 1.0, link: LinkParams | None = None
+        self,
+        *,
+        stream: LinkModel,
+        datagrams: LinkModel,
+        open_at_s: float = 1.0,
+        link: LinkParams | None = None,
+        cloud_bytes: int = 50_000,
     ) -> None:
         self.world = World(link=link)
         self.robot = self.world.client("robot", stream)
@@ -40,7 +46,7 @@ class TwoLanes:
         self.logged = 0
         every = self.world.network.every
         every(0.02, lambda now: self.core.send(self.pose, b"p" * 100, 0, now=now), node=self.robot)
-        every(0.1, lambda now: self.core.send(self.cloud, b"c" * 100_000, 0, now=now), node=self.robot)
+        every(0.1, lambda now: self.core.send(self.cloud, b"c" * cloud_bytes, 0, now=now), node=self.robot)
         every(0.1, self._log, node=self.robot)
         self.world.network.at(open_at_s, self._open)
 
@@ -96,7 +102,10 @@ class ShortPath(TwoLanes):
         steps = () if slower_bps is None else (RateStep(8.0, slower_bps),)
         path = LinkModel(rate_bps=8e6, delay_s=0.002, rate_steps=steps)
         super().__init__(
-            stream=replace(path, loss=stream_loss).as_stream(), datagrams=path, link=LinkParams(stream_from_bps=3e6)
+            stream=replace(path, loss=stream_loss).as_stream(),
+            datagrams=path,
+            link=LinkParams(stream_from_bps=3e6),
+            cloud_bytes=100_000,
         )
         self.used: list[int] = []
         self.sizes: list[int] = []
@@ -261,7 +270,7 @@ def _poses_lost(redundancy: Redundancy) -> float:
         robot.core.send(pose, b"p" * 100, 0, now=now)
 
     world.network.at(2.0, lambda _now: world.network.every(0.02, offer, node=robot, first_s=2.0))
-    world.run(62.0)
+    world.run(32.0)
     world.validate()
     assert len({got.seq for got in site.on("/robot/pose")}) == len(site.on("/robot/pose"))
     return 1 - len(site.on("/robot/pose")) / len(offered)
