@@ -191,17 +191,17 @@ def test_a_cloud_goes_to_its_summary_while_the_link_is_thin_and_comes_back(*, in
     r.feed(pose, 50.0, 120)
 
     def send(now: float) -> None:
-        if r.world.network.elapsed_s < 55.0:
+        if r.world.network.elapsed_s < 50.0:
             item.offer(TEXT, now)
 
     r.world.network.after(0.05, lambda _now: r.world.network.every(0.2, send, node=r.robot))
     r.world.network.every(0.5, lambda _now: r.world.validate())
-    r.world.run(60.0)
+    r.world.run(55.0)
     levels = [step.decision.chosen.summaries for step in r.steps]
     changed = [(r.steps[i + 1].now, level) for i, (old, level) in enumerate(itertools.pairwise(levels)) if level != old]
     assert [level for _, level in changed] == [(False, False, True), ALL_RAW]
     thin_s, back_s = (at_s - r.world.network.start_s for at_s, _ in changed)
-    assert 5.0 < thin_s <= 8.0 and 35.0 < back_s <= 60.0
+    assert 5.0 < thin_s <= 8.0 and 35.0 < back_s <= 50.0
     # To see that the link is better a whole one is sent now and then, which takes a tenth of it at most.
     probes = [at_s for at_s, level in item.changes if level is SummaryLevel.RAW and thin_s < at_s < 35.0]
     assert 1 <= len(probes) <= 3

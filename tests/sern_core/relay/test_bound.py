@@ -264,7 +264,8 @@ def test_whatever_comes_the_bound_holds_and_nothing_is_lost_silently(seed: int) 
     cancel = world.network.every(0.05, send, node=robot).cancel
     world.run(10.0)
     cancel()
-    world.run(60.0)
+    world.until(lambda: waiting(world) == 0)
+    world.run(1.0)
     for channel in channels:
         topic = channel.stream.id.topic
         sent = list(range(1, channel.next_seq))

@@ -332,7 +332,7 @@ def test_a_relay_that_begins_anew_tells_of_who_is_there() -> None:
 @pytest.mark.parametrize("said_gone", [True, False])
 def test_a_robot_that_a_new_relay_never_hears_of_is_gone(said_gone: bool) -> None:
     """A robot that was gone is given up at once; one that was there has LET_GO_S to come to the new relay."""
-    world = World().watch()
+    world = World().watch(0.5)
     robot = world.client("robot", LinkModel(blackouts=(Window(5.0, 1e6),), disconnect_after_s=0.2).as_stream())
     site = world.client("site", patterns=["/robot/.*"])
     robot.publish("/robot/odom", spec())
