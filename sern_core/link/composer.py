@@ -65,7 +65,9 @@ class Composer:
         pends = scheduler.pends
         if not window_open and pends:
             self._outlook.full(now)
-        if not (pends or control.waits or self._taking.watermarks or sender.paper):
+        # Behind a window that is shut class control alone may leave.
+        waits = pends or control.waits if window_open else scheduler.pending(PriorityClass.CONTROL)
+        if not (waits or self._taking.watermarks or sender.paper):
             return window_open
         if not control_only and self._taking.watermarks:
             for channel_id, seq in self._taking.take_watermarks(MAX_WATERMARKS, acked_seq=control.acked_seq):
