@@ -272,7 +272,7 @@ def in_stream(index: int) -> InStream:
 
 
 @pytest.mark.parametrize("batches", [True, False])
-@pytest.mark.parametrize("seed", seeds(20))
+@pytest.mark.parametrize("seed", seeds(10))
 def test_whatever_changes_the_peer_ends_up_with_what_is(seed: int, batches: bool) -> None:
     random = Random(seed)
     interest = Interest()

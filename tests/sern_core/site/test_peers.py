@@ -12,6 +12,7 @@ from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import ClientName, Encoding, PriorityClass, TopicName
 from sern_core.wire import framing
 from sern_sim.models import LinkModel, Window
+from tests.exploring import also
 from tests.views import peers, statuses
 from tests.world import SimClient, World, spec
 
@@ -402,8 +403,14 @@ def test_a_robot_that_ends_its_topics_while_our_own_link_is_down_is_let_go() -> 
 # --- under load -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("lossless", [True, False])
-@pytest.mark.parametrize("loaded", [*PriorityClass, None])
+@pytest.mark.parametrize(
+    ("loaded", "lossless"),
+    [
+        (PriorityClass.CONTROL, True), (PriorityClass.CONTROL, False), (PriorityClass.STATE, True),
+        (PriorityClass.BULK, False), (None, True), (None, False),
+        *also((PriorityClass.STATE, False), (PriorityClass.BULK, True)),
+    ],
+)  # fmt: skip
 def test_at_thirteen_times_what_the_link_carries_a_lost_robot_is_known_at_once(
     loaded: PriorityClass | None, lossless: bool
 ) -> None:

@@ -41,8 +41,8 @@ def run(model: LinkModel, until_s: float, seed: int) -> World:
 @pytest.mark.parametrize(
     ("jitter_s", "seed"),
     [
-        (0.0, 1), (0.002, 1), (0.005, 1), (0.005, 2), (0.005, 3), (0.010, 1), (0.010, 2),
-        *also((0.0, 2), (0.0, 3), (0.002, 2), (0.002, 3), (0.010, 3)),
+        (0.0, 1), (0.002, 1), (0.005, 2), (0.005, 3), (0.010, 1),
+        *also((0.0, 2), (0.0, 3), (0.002, 2), (0.002, 3), (0.005, 1), (0.010, 2), (0.010, 3)),
     ],
 )  # fmt: skip
 def test_a_link_that_was_thin_is_filled_again(jitter_s: float, seed: int) -> None:
@@ -50,13 +50,13 @@ def test_a_link_that_was_thin_is_filled_again(jitter_s: float, seed: int) -> Non
     assert world.goodput_bps(BACK_S + FIVE_S, BACK_S + FIVE_S + 2.0) > 0.9 * carries_bps(8e6)
 
 
-@pytest.mark.parametrize("jitter_s", [0.0, 0.002, 0.005, 0.010, 0.020])
+@pytest.mark.parametrize("jitter_s", [0.0, 0.005, 0.020, *also(0.002, 0.010)])
 def test_a_link_that_was_gone_is_filled_again(jitter_s: float) -> None:
     world = run(link(8e6, jitter_s, gone=True), BACK_S + FIVE_S + 2.0, 1)
     assert world.goodput_bps(BACK_S + FIVE_S, BACK_S + FIVE_S + 2.0) > 0.85 * carries_bps(8e6)
 
 
-@pytest.mark.parametrize(("rate_bps", "thin_bps"), [(4e6, 0.6e6), (16e6, 0.6e6), (16e6, 2e6)])
+@pytest.mark.parametrize(("rate_bps", "thin_bps"), [(4e6, 0.6e6), (16e6, 0.6e6), *also((16e6, 2e6))])
 def test_rates_of_all_kinds_are_found_again(rate_bps: float, thin_bps: float) -> None:
     world = run(link(rate_bps, 0.005, thin_bps=thin_bps), BACK_S + FIVE_S + 2.0, 1)
     assert world.goodput_bps(BACK_S + FIVE_S, BACK_S + FIVE_S + 2.0) > 0.85 * carries_bps(rate_bps)
@@ -64,7 +64,7 @@ def test_rates_of_all_kinds_are_found_again(rate_bps: float, thin_bps: float) ->
 
 @pytest.mark.parametrize(
     ("rate_bps", "jitter_s"),
-    [(4e6, 0.001), (8e6, 0.0), (8e6, 0.0005), (8e6, 0.001), *also((4e6, 0.0), (4e6, 0.0005))],
+    [(4e6, 0.001), (8e6, 0.0005), (8e6, 0.001), *also((4e6, 0.0), (4e6, 0.0005), (8e6, 0.0))],
 )
 def test_little_jitter_is_no_reason_for_a_queue(rate_bps: float, jitter_s: float) -> None:
     poses = run(link(rate_bps, jitter_s), 14.0, 1).poses_ms(5.0)
