@@ -206,12 +206,18 @@ def test_when_the_link_keeps_a_rate_again_the_queue_goes() -> None:
 
 
 @pytest.mark.parametrize(
-    "change", [{}, {"loss": 0.05}, {"jitter_s": 0.005}, {"reorder": 0.02, "reorder_delay_s": 0.005}]
+    ("change", "until_s"),
+    [
+        ({}, 24.0),
+        ({"loss": 0.05}, 24.0),
+        ({"jitter_s": 0.005}, 40.0),
+        ({"reorder": 0.02, "reorder_delay_s": 0.005}, 24.0),
+    ],
 )
-def test_a_link_of_one_rate_is_never_taken_for_one_that_swings(change: dict[str, float]) -> None:
+def test_a_link_of_one_rate_is_never_taken_for_one_that_swings(change: dict[str, float], until_s: float) -> None:
     model = LinkModel(rate_bps=4e6, delay_s=0.025, overhead_bytes=60, **change)  # type: ignore[arg-type]
-    _, ages_ms, _ = carried(model, PARAMS, 24.0)
-    _, without_ms, _ = carried(model, NEVER, 24.0)
+    _, ages_ms, _ = carried(model, PARAMS, until_s)
+    _, without_ms, _ = carried(model, NEVER, until_s)
     assert ages_ms == without_ms
 
 
