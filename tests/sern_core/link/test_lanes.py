@@ -171,11 +171,11 @@ def test_it_falls_back_when_datagrams_cease_and_returns_by_itself() -> None:
 
 
 def test_a_session_outlives_the_stream_and_a_fresh_pose_is_there_at_once() -> None:
-    stream, datagrams = models(Window(10.0, 24.0))  # the stream's connection breaks after 5 s of it
+    stream, datagrams = models(Window(5.0, 19.0))  # the stream's connection breaks after 5 s of it
     lanes = TwoLanes(stream=stream, datagrams=datagrams)
-    lanes.run(36.0)
+    lanes.run(27.0)
     assert lanes.robot.ups == [False]  # one session all along
-    assert lanes.first_pose_after(24.0) <= 0.3
+    assert lanes.first_pose_after(19.0) <= 0.3
     assert lanes.core.link.lanes.by_id[LANE_ZMQ].up
     lanes.check_log()
 
@@ -183,13 +183,13 @@ def test_a_session_outlives_the_stream_and_a_fresh_pose_is_there_at_once() -> No
 @pytest.mark.parametrize("end", ["robot", "relay"])
 def test_packet_numbers_of_the_datagram_lane_that_run_out_begin_another_session(end: str) -> None:
     lanes = TwoLanes(stream=models()[0], datagrams=models()[1])
-    lanes.run(5.0)
+    lanes.run(3.0)
     link = lanes.core.link if end == "robot" else lanes.world.relay.hub.links[ClientName("robot")]
     link.lanes.by_id[LANE_UDP].flight.next_number = framing.MAX_PACKET_NUMBER - 5
-    lanes.run(5.0)
+    lanes.run(3.0)
     assert lanes.robot.ups == [False, True]
     lanes._open(lanes.world.network.now)
-    lanes.run(5.0)
+    lanes.run(3.0)
     assert lanes.core.link.lane.id == LANE_UDP
     lanes.check_log()
 

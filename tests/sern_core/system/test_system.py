@@ -81,7 +81,7 @@ def test_thirteen_times_as_much_class_control_as_the_link_carries_leaves_a_way_f
     site = world.client("site", patterns=["/robot/.*"])
     pose = robot.publish("/robot/pose", spec(PriorityClass.CONTROL, depth=10))
     robot.every(size * 8 / (13 * rate_bps), pose, b"p" * size)
-    world.run(15.0)  # what was sent before the link's capacity was known has left its queue
+    world.run(10.0)  # what was sent before the link's capacity was known has left its queue
     robot.publish("/robot/chat", spec(reliable=True), definition="string data")
     world.until(lambda: len(site.opened) == 2, within_s=2.0, what="the site hears of another stream")
     world.validate()
