@@ -70,6 +70,8 @@ class Site:
 
     def next_datagram(self, *, now: float) -> bytes | None:
         count = len(self.endpoints)
+        if count == 1:
+            return self.endpoints[0].poll(now)
         for step in range(count):
             index = (self._turn + step) % count
             data = self.endpoints[index].poll(now)
@@ -79,7 +81,10 @@ class Site:
         return None
 
     def next_deadline(self) -> float | None:
-        deadline_s = min([endpoint.deadline() for endpoint in self.endpoints], default=inf)
+        endpoints = self.endpoints
+        deadline_s = endpoints[0].deadline() if len(endpoints) == 1 else inf
+        if len(endpoints) > 1:
+            deadline_s = min([endpoint.deadline() for endpoint in endpoints])
         if self.tick_s and deadline_s < inf:
             ticks = -(-deadline_s // self.tick_s)
             deadline_s = ticks * self.tick_s

@@ -285,7 +285,6 @@ class Network:
         else:
             slots = touched = {} if slot is None else {slot: None}
             self._add_dirty(state.take_dirty, touched)
-        watchdog = self._watchdog
         while True:
             for each in slots:
                 if each.connected:
@@ -295,6 +294,7 @@ class Network:
                 more |= self._add_dirty(state.take_dirty, touched)
             if not more:
                 break
+            watchdog = self._watchdog
             watchdog.count += 1
             if watchdog.count > watchdog.quiet:
                 watchdog.note(self.elapsed_s, "more to send after sending")
@@ -313,8 +313,8 @@ class Network:
         return len(touched) > before
 
     def _drain(self, slot: Slot) -> None:
-        next_datagram = slot.next_datagram
-        data = next_datagram(now=self.now)
+        next_datagram, now = slot.next_datagram, self.now
+        data = next_datagram(now=now)
         if data is None:
             return
         direction = slot.out
@@ -334,7 +334,7 @@ class Network:
                     heappush(self._heap, (arrival_ns, self._sequence, _DELIVER, direction, data, direction.epoch))
             if self._log is not None:
                 self._log.add(elapsed_ns, "send" if arrival_ns >= 0 else "lost", slot.name, data)
-            data = next_datagram(now=self.now)
+            data = next_datagram(now=now)
 
     def _on_arrival(self, direction: Direction, data: bytes, epoch: int) -> None:
         link = direction.link

@@ -1,10 +1,12 @@
 """Ports and nodes: what the virtual-time network joins, and how it keeps them."""
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Protocol
+from typing import Final, Protocol
 
 from sern_sim.links import NEVER, NS, Link, LinkStats
 from sern_sim.models import LinkModel
+
+NEVER_S: Final = NEVER / NS
 
 
 class Port(Protocol):
@@ -47,13 +49,10 @@ class SoloNode:
 
     def __init__(self, port: Port, after_event: Callable[[float], bool | None] | None = None) -> None:
         self.port = port
-        self._after_event = after_event
+        self.after_event = after_event
 
     def ports(self) -> Sequence[Port]:
         return (self.port,)
-
-    def after_event(self, now: float) -> bool | None:
-        return self._after_event(now) if self._after_event is not None else None
 
 
 class NodeState:
@@ -145,12 +144,14 @@ class Slot:
     def arm(self, start_ns: int, elapsed_ns: int) -> int:
         """Take the port's deadline. Returns when a timer event is to be made for it; `NEVER`: none, or there is one."""
         deadline_s = self.next_deadline()
-        if deadline_s is None or deadline_s >= NEVER / NS:
+        if deadline_s is None or deadline_s >= NEVER_S:
             self.due_ns = NEVER
             return NEVER
         # A deadline made as now + delay carries the rounding of floats; to the nearest nanosecond it is exact again,
         # whatever the clock's offset.
-        due_ns = max(round(deadline_s * NS) - start_ns, elapsed_ns)
+        due_ns = round(deadline_s * NS) - start_ns
+        if due_ns < elapsed_ns:
+            due_ns = elapsed_ns
         self.due_ns = due_ns
         self.due_s = deadline_s
         pending = self.pending

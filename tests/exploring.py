@@ -16,7 +16,7 @@ Case = TypeVar("Case")
 SEED: Final = os.environ.get("SERN_EXPLORE", "")
 TIMES: Final = 10
 """How many times the cases of a usual run are tried."""
-USUAL: Final = 100
+USUAL: Final = 60
 """Cases of a test that asks for no number."""
 
 

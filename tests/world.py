@@ -103,21 +103,30 @@ class ClockedPort:
         self.sent: Callable[[bytes, float], object] | None = None
 
     @property
+    def clock(self) -> Clock:
+        return self._clock
+
+    @clock.setter
+    def clock(self, clock: Clock) -> None:
+        self._clock = clock
+        self._true = clock == Clock()
+
+    @property
     def dirty(self) -> bool:
         return getattr(self.inner, "dirty", True)
 
     def receive(self, data: bytes, *, now: float) -> None:
-        self.inner.receive(data, now=self.clock.local(now))
+        self.inner.receive(data, now=now if self._true else self._clock.local(now))
 
     def next_datagram(self, *, now: float) -> bytes | None:
-        data = self.inner.next_datagram(now=self.clock.local(now))
+        data = self.inner.next_datagram(now=now if self._true else self.clock.local(now))
         if data is not None and self.sent is not None:
             self.sent(data, now)
         return data
 
     def next_deadline(self) -> float | None:
         deadline_s = self.inner.next_deadline()
-        if deadline_s is None or self.clock == Clock():
+        if deadline_s is None or self._true:
             return deadline_s
         # A nanosecond late: converted back it must not lie before the deadline.
         return self.clock.true(deadline_s) + 1e-9
@@ -381,6 +390,7 @@ class SimHub:
             lossless=world.lossless,
         )
         self.sides: dict[ClientName, ClockedPort] = {}
+        self._sides: list[tuple[HubPort, ClockedPort]] = []
         self.more_ports: list[Port] = []
 
     @property
@@ -390,7 +400,9 @@ class SimHub:
     def port(self, client: ClientName) -> ClockedPort:
         port = self.sides.get(client)
         if port is None:
-            port = self.sides[client] = ClockedPort(HubPort(self.hub, client), self.clock)
+            inner = HubPort(self.hub, client)
+            port = self.sides[client] = ClockedPort(inner, self.clock)
+            self._sides.append((inner, port))
         return port
 
     def ports(self) -> list[Port]:
@@ -398,7 +410,7 @@ class SimHub:
 
     def take_dirty(self) -> list[Port]:
         """Only these ports are asked for more after an event on another."""
-        return [*(port for port in self.sides.values() if port.dirty), *self.more_ports]
+        return [*[side for port, side in self._sides if port.dirty], *self.more_ports]
 
     def links(self) -> Iterator[Link]:
         yield from self.hub.links.values()

@@ -62,8 +62,13 @@ class Composer:
         limit = lane.fragment_bytes - (framing.ACK.size if lane.arrivals.unacked else 0)
         control_only = lane is self._lanes.priority_lane
         window_open = lane.open_at(now)
-        if not window_open and sender.pending:
+        pends = scheduler.pends
+        if not window_open and pends:
             self._outlook.full(now)
+        # Behind a window that is shut class control alone may leave.
+        waits = pends or control.waits if window_open else scheduler.pending(PriorityClass.CONTROL)
+        if not (waits or self._taking.watermarks or sender.paper):
+            return window_open
         if not control_only and self._taking.watermarks:
             for channel_id, seq in self._taking.take_watermarks(MAX_WATERMARKS, acked_seq=control.acked_seq):
                 datagram.watermark(channel_id, seq)

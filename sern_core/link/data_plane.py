@@ -233,13 +233,19 @@ class DataPlane:
         arrivals = lane.arrivals
         if arrivals.unacked and not self._end.half_read and (due_s := arrivals.deadline_s()) < deadline:
             deadline = due_s
-        for candidate in (
-            lane.probe_due_s if lane.stalled else lane.stall_deadline(),
-            None if lane.lossless else lane.flight.loss_deadline(),
-            self._service_deadline(lane) if lane is self._lanes.lane and self._backlog else None,
-            lane.copies[0][0] if lane.copies else None,
-            self._priority_lane_deadline(lane) if lane is self._lanes.priority_lane else None,
-        ):
+        candidate = lane.probe_due_s if lane.stalled else lane.stall_deadline()
+        if candidate is not None and candidate < deadline:
+            deadline = candidate
+        if not lane.lossless and (candidate := lane.flight.loss_deadline()) is not None and candidate < deadline:
+            deadline = candidate
+        if lane is self._lanes.lane and self._backlog:
+            candidate = self._service_deadline(lane)
+            if candidate is not None and candidate < deadline:
+                deadline = candidate
+        if lane.copies and (due_s := lane.copies[0][0]) < deadline:
+            deadline = due_s
+        if lane is self._lanes.priority_lane:
+            candidate = self._priority_lane_deadline(lane)
             if candidate is not None and candidate < deadline:
                 deadline = candidate
         return deadline

@@ -112,6 +112,11 @@ class Handshake:
         return self._hello_due_s is not None and self.transport_up
 
     @property
+    def speaks(self) -> bool:
+        """Whether anything is to be said before what is of a session, now or later."""
+        return bool(self._out) or self._hello_due_s is not None
+
+    @property
     def hello_due_s(self) -> float | None:
         """When to say HELLO."""
         return self._hello_due_s

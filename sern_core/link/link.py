@@ -244,7 +244,7 @@ class Link:
         try:
             if self.taking.fresh:
                 self.taking.hand_on(now)
-            if lane == LANE_ZMQ:
+            if lane == LANE_ZMQ and self.handshake.speaks:
                 if (said := self.handshake.next_datagram(now)) is not None:
                     return said
                 if self.handshake.greeting:
@@ -285,7 +285,9 @@ class Link:
     def next_deadline(self, lane: int = LANE_ZMQ) -> float | None:
         """When to call `handle_timeout` and `next_datagram` at the latest, if nothing else happens."""
         deadline_s, read_due_s = self._lane_deadline(lane), self.reading.due_s
-        return deadline_s if read_due_s is None or (deadline_s is not None and deadline_s < read_due_s) else read_due_s
+        if read_due_s is None or (deadline_s is not None and deadline_s < read_due_s):
+            return deadline_s
+        return read_due_s
 
     def _lane_deadline(self, lane: int) -> float | None:
         state, established = self.lanes.by_id.get(lane), self.end.established

@@ -211,8 +211,7 @@ class Sender:
     @property
     def pending(self) -> bool:
         """Whether more could be sent if the window allowed it."""
-        pending = self.scheduler.pending
-        return bool(pending(PriorityClass.BULK) or pending(PriorityClass.STATE) or pending(PriorityClass.CONTROL))
+        return self.scheduler.pends
 
     def queued(self) -> dict[str, tuple[int, int]]:
         """Messages and bytes that wait for the lane, by class label."""

@@ -126,7 +126,11 @@ class RttEstimator:
         """Retransmission timeout: SRTT + max(G, 4·RTTVAR), between MIN_RTO_S and MAX_RTO_S."""
         if not self.samples:
             return 1.0
-        return min(MAX_RTO_S, max(MIN_RTO_S, self.srtt_s + max(RTT_GRANULARITY_S, 4.0 * self.rttvar_s)))
+        margin_s = 4.0 * self.rttvar_s
+        rto_s = self.srtt_s + (margin_s if margin_s > RTT_GRANULARITY_S else RTT_GRANULARITY_S)
+        if rto_s < MIN_RTO_S:
+            return MIN_RTO_S
+        return rto_s if rto_s < MAX_RTO_S else MAX_RTO_S
 
     def reset(self) -> None:
         """Forget everything: the path is another one."""

@@ -144,9 +144,13 @@ class Flight:
                 self.reorder_s = max(self.reorder_s, min(REORDER_MARGIN * (now - passed_s), self.rtt.srtt_s))
 
     def loss_timeout_s(self) -> float:
-        if not self.rtt.samples:
+        rtt = self.rtt
+        if not rtt.samples:
             return FIRST_LOSS_TIMEOUT_S
-        return max(MIN_LOSS_TIMEOUT_S, 2 * self.rtt.srtt_s + 0.030, self.rtt.rto_s)
+        timeout_s, rto_s = 2 * rtt.srtt_s + 0.030, rtt.rto_s
+        if timeout_s < MIN_LOSS_TIMEOUT_S:
+            timeout_s = MIN_LOSS_TIMEOUT_S
+        return rto_s if rto_s > timeout_s else timeout_s
 
     @property
     def oldest_s(self) -> float:
@@ -154,7 +158,11 @@ class Flight:
         return next(iter(self.packets.values())).sent_s if self.packets else inf
 
     def stall_timeout_s(self) -> float:
-        return max(STALL_MIN_S, STALL_RTTS * self.rtt.srtt_s) if self.rtt.samples else FIRST_STALL_S
+        rtt = self.rtt
+        if not rtt.samples:
+            return FIRST_STALL_S
+        timeout_s = STALL_RTTS * rtt.srtt_s
+        return timeout_s if timeout_s > STALL_MIN_S else STALL_MIN_S
 
     def lost(self, *, now: float) -> list[Packet]:
         """Packets to give up, oldest first; they leave the flight."""
@@ -191,7 +199,8 @@ class Flight:
         """When the oldest packet is lost by time alone; a hair late, so that `lost` agrees whatever the rounding."""
         if self.lossless or not self.packets:
             return None
-        return min(self.oldest_s + self.loss_timeout_s(), self._passed_due_s) + 1e-6
+        due_s, passed_due_s = self.oldest_s + self.loss_timeout_s(), self._passed_due_s
+        return (passed_due_s if passed_due_s < due_s else due_s) + 1e-6
 
     def abandon(self) -> list[Packet]:
         """The transport is gone: everything in flight comes back, oldest first. Numbers go on."""

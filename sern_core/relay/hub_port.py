@@ -73,10 +73,11 @@ class HubPort:
 
     def receive(self, data: framing.Datagram, *, now: float) -> None:
         """One datagram. Raises WireError or VersionError; the caller closes the connection."""
-        if self.link is not None and self.current and data[2:3] != b"\x01":
-            had_session = self.link.established
-            self.link.receive(data, now=now)
-            if had_session and data[2] == framing.Kind.CLOSE and not self.link.established:
+        link = self.link
+        if link is not None and self.current and data[2:3] != b"\x01":
+            had_session = link.established
+            link.receive(data, now=now)
+            if had_session and data[2] == framing.Kind.CLOSE and not link.established:
                 self.hub.left(self.client, now=now)
             return
         try:
@@ -121,12 +122,16 @@ class HubPort:
     def next_datagram(self, *, now: float) -> bytes | None:
         if self._out:
             return self._out.pop(0)
-        return self.link.next_datagram(now=now) if self.link is not None and self.current else None
+        link = self.link
+        if link is None or self.hub.clients.port_of.get(self.client) is not self:
+            return None
+        return link.next_datagram(now=now)
 
     def next_deadline(self) -> float | None:
-        if self.link is None or not self.current:
+        link, hub = self.link, self.hub
+        if link is None or hub.clients.port_of.get(self.client) is not self:
             return None
-        deadline_s, due_s = self.link.next_deadline(), self.hub.matching.due_s
+        deadline_s, due_s = link.next_deadline(), hub.matching.due_s
         if not due_s:
             return deadline_s
         match_s = due_s.get(self.client)
@@ -143,6 +148,7 @@ class HubPort:
     def dirty(self) -> bool:
         if self._out:
             return True
-        if self.link is None or not self.current:
+        link, hub = self.link, self.hub
+        if link is None or hub.clients.port_of.get(self.client) is not self:
             return False
-        return self.link.dirty or self.client in self.hub.matching.due_s
+        return link.dirty or self.client in hub.matching.due_s

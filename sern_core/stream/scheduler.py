@@ -296,6 +296,11 @@ class Scheduler:
         """Channels of the class that could be served; those being encoded are not counted."""
         return len(self._tables[priority].channel_ids)
 
+    @property
+    def pends(self) -> bool:
+        """Whether a channel of any class could be served."""
+        return bool(self._bulk.channel_ids or self._state.channel_ids or self._control.channel_ids)
+
     # Whose turn it is
 
     def pick(self, *, now: float, window_open: bool = True) -> int | None:

@@ -14,6 +14,7 @@ from sern_sim.pilot import FigureOfEight, Pilot
 from sern_sim.plant import Plant
 from sern_sim.robot import GRAVITY_MPS2, LIDAR_HEIGHT_M, LIDAR_RANGE_M, STEP_S, Pose2, RobotState, SimulatedJackal
 from sern_sim.terrain import DITCH_X_M, HALF_SIZE_M, Block, Label, Terrain
+from tests.exploring import also
 
 CELLS = 41
 
@@ -216,7 +217,7 @@ def test_what_is_looked_at_does_not_change_where_it_goes() -> None:
     assert states[0] == states[1]
 
 
-@pytest.mark.parametrize("seed", [0, 2])
+@pytest.mark.parametrize("seed", [0, *also(2)])
 def test_it_stays_within_centimetres_of_its_plan_on_hills(seed: int) -> None:
     robot = MujocoJackal(Random(seed))
     way = FigureOfEight(Random(seed + 1), robot.state.pose, 0.0)

@@ -15,7 +15,7 @@ from tests.sern_sim.strategies import link_models, rate_steps, windows
 from tests.sern_sim.toys import ArqReceiver, ArqSender
 
 RUN_S = 10.0
-PURE = settings(max_examples=cases(150))
+PURE = settings(max_examples=cases(80))
 
 sendings = st.lists(
     st.tuples(st.integers(0, 300), st.integers(0, 3000)),  # milliseconds since the last packet, bytes
@@ -98,7 +98,7 @@ def test_serialisation_is_the_integral_of_the_rate(
         busy_ns = arrival_ns
 
 
-@settings(PURE, max_examples=cases(60))
+@settings(PURE, max_examples=cases(40))
 @given(st.sampled_from(LinkMode).flatmap(lambda mode: st.tuples(*[link_models(mode=mode, run_s=3.0)] * 2)), st.data())
 def test_an_arq_gets_through_any_link_and_every_packet_is_accounted_for(
     links: tuple[LinkModel, LinkModel], data: st.DataObject

@@ -34,7 +34,7 @@ SPECS = st.builds(
 
 @given(specs=st.lists(SPECS, min_size=1, max_size=4), sizes=st.lists(st.sampled_from([0, 1, 300, 20_000]), min_size=1))
 @example(specs=[TopicSpec(lifespan_s=0.0, reliability=Reliability.RELIABLE)], sizes=[10])
-@settings(max_examples=cases(40))
+@settings(max_examples=cases(24))
 def test_any_spec_that_may_be_announced_can_be_adapted_to(specs: list[TopicSpec], sizes: list[int]) -> None:
     world = World()
     robot, site = world.client("robot"), world.client("site", patterns=[".*"])

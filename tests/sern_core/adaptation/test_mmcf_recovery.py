@@ -1,5 +1,6 @@
 """After a link returns, what fits on it flows again within seconds, and looking for that harms no thin link."""
 
+from itertools import product
 from math import inf
 from random import Random
 
@@ -13,11 +14,12 @@ from sern_core.adaptation.trial import REST_INTERVALS, TIMED_GAIN, TIMED_INTERVA
 from sern_core.vocabulary.params import LinkParams
 from sern_sim.models import LinkModel, RateStep, Window
 from tests.adapting import ALL_RAW, BULK, CONTROL, GRID, LEVELS, TEXT, WEIGHTS, Rig, Thinned, rig
+from tests.exploring import also
 from tests.world import spec
 
 FLOORS = (1.0, 1.0, 1.0)
 LOW_BPS = 0.3e6
-FALLS_S, RETURNS_S, END_S = 15.0, 30.0, 40.0
+SETTLED_S, FALLS_S, RETURNS_S, END_S = 5.0, 10.0, 20.0, 28.0
 BODY = (TEXT + TEXT)[:100_000]
 
 
@@ -50,10 +52,20 @@ def clouds_in(r: Rig, from_s: float, to_s: float) -> int:
     return sum(from_s <= got.at_s - start_s < to_s for got in r.site.on("/robot/points") if len(got.body) == len(BODY))
 
 
-@pytest.mark.parametrize("summaries", [False, True], ids=["thinned", "summarised"])
-@pytest.mark.parametrize("lossless", [False, True], ids=["datagrams", "stream"])
-@pytest.mark.parametrize(("high_bps", "rate_hz"), [(4e6, 2.5), (40e6, 10.0)], ids=["4-Mbit", "40-Mbit"])
-@pytest.mark.parametrize("gone", [False, True], ids=["thin", "blackout"])
+def _half(*, odd: bool) -> list[tuple[bool, float, float, bool, bool]]:
+    """Of all ways to choose, every second one: any three of the choices are there in all their ways."""
+    return [
+        (gone, high_bps, rate_hz, lossless, summaries)
+        for gone, (high_bps, rate_hz), lossless, summaries in product(
+            (False, True), ((4e6, 2.5), (20e6, 5.0)), (False, True), (False, True)
+        )
+        if (gone + (high_bps > 4e6) + lossless + summaries) % 2 == odd
+    ]
+
+
+@pytest.mark.parametrize(
+    ("gone", "high_bps", "rate_hz", "lossless", "summaries"), [*_half(odd=False), *also(*_half(odd=True))]
+)
 def test_within_five_seconds_of_its_return_a_link_carries_what_it_did(
     *, gone: bool, high_bps: float, rate_hz: float, lossless: bool, summaries: bool
 ) -> None:
@@ -62,7 +74,7 @@ def test_within_five_seconds_of_its_return_a_link_carries_what_it_did(
     model = LinkModel(rate_bps=high_bps, delay_s=0.005, rate_steps=steps, blackouts=blackouts)
     r = flowing(model, rate_hz=rate_hz, lossless=lossless, summaries=summaries)
     r.world.run(END_S)
-    before_hz = clouds_in(r, 8.0, FALLS_S) / (FALLS_S - 8.0)
+    before_hz = clouds_in(r, SETTLED_S, FALLS_S) / (FALLS_S - SETTLED_S)
     assert before_hz > 0.95 * rate_hz, "a wide link is not starved: everything fits, so everything goes"
     assert clouds_in(r, FALLS_S + 3.0, RETURNS_S) < 0.3 * before_hz * (RETURNS_S - FALLS_S - 3.0)
     assert clouds_in(r, RETURNS_S + 5.0, END_S) >= 0.8 * before_hz * (END_S - RETURNS_S - 5.0)
@@ -92,9 +104,9 @@ def test_a_wide_link_that_was_never_full_is_not_taken_to_be_as_narrow_as_what_wa
     r = rig(policy, LinkModel(rate_bps=1e9, delay_s=1e-4), lossless=lossless, link=LinkParams())
     r.feed(r.robot.publish("/robot/pose", spec(CONTROL, lifespan_s=1.0)), 250.0, 380)
     r.feed(r.robot.publish("/robot/images", spec(BULK, depth=1)), 100.0, 10_700)
-    r.world.run(6.0)
+    r.world.run(4.0)
     assert [step.decision.chosen.rates for step in r.steps] == [(1.0, 1.0, 1.0)] * len(r.steps)
-    assert len(r.site.on("/robot/images")) >= 0.99 * 6.0 * 100.0
+    assert len(r.site.on("/robot/images")) >= 0.99 * 4.0 * 100.0
     r.world.validate()
 
 
@@ -112,19 +124,19 @@ def test_a_class_of_large_and_small_messages_is_not_thinned_on_a_link_that_has_r
     r.feed(r.robot.publish("/robot/pose", spec(CONTROL, lifespan_s=1.0)), 250.0, 380)
     for number, (rate_hz, size) in enumerate(MIXED):
         r.feed(r.robot.publish(f"/robot/{number}", spec(BULK, lifespan_s=1.0)), rate_hz, size, body=body)
-    r.world.run(10.0)
+    r.world.run(6.0)
     assert [step.decision.chosen.rates for step in r.steps] == [(1.0, 1.0, 1.0)] * len(r.steps)
-    assert r.adapter.switches <= 2
+    assert r.adapter.switches <= 1
     r.world.validate()
 
 
 @pytest.mark.parametrize("lossless", [False, True], ids=["datagrams", "stream"])
 def test_looking_for_a_better_link_takes_a_tenth_of_a_thin_one_at_most(*, lossless: bool) -> None:
-    """A minute on a link that never gets better: what raw messages take beside their summaries."""
+    """Half a minute on a link that never gets better, and one look in it: what raw messages take beside summaries."""
     steps = (RateStep(10.0, LOW_BPS),)
     model = LinkModel(rate_bps=4e6, delay_s=0.005, rate_steps=steps)
     r = flowing(model, rate_hz=2.5, lossless=lossless, summaries=True)
-    from_s, to_s = 15.0, 75.0
+    from_s, to_s = 15.0, 45.0
     r.world.run(to_s)
     raw_bits = 8.0 * 0.6 * len(BODY) * clouds_in(r, from_s, to_s)  # Zstandard leaves 0.6
     assert raw_bits <= 0.1 * LOW_BPS * (to_s - from_s)

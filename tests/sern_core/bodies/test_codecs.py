@@ -20,7 +20,7 @@ if sys.version_info >= (3, 14):
 else:
     from backports import zstd as zstandard
 
-STEADY = settings(max_examples=cases(200))
+STEADY = settings(max_examples=cases(100))
 PACKING = [mode for mode in codecs.LOSSLESS if mode is not Compression.NONE]
 CAP = 1 << 20
 TEXT = b"a robot drives along the hall and reports where it is; " * 200
@@ -155,7 +155,7 @@ def mutated() -> st.SearchStrategy[tuple[int, bytes]]:
 
 
 @given(case=mutated() | st.tuples(st.integers(0, 255), st.binary(max_size=200)))
-@settings(STEADY, max_examples=cases(1500))
+@settings(STEADY, max_examples=cases(600))
 def test_any_bytes_decode_to_what_they_claim_or_raise_codec_error(case: tuple[int, bytes]) -> None:
     codec, body = case
     try:

@@ -29,7 +29,7 @@ from tests.world import World, spec
 pytest.importorskip("DracoPy", reason="the Python package DracoPy (extra lossy) is not installed")
 pytest.importorskip("PIL", reason="the Python package Pillow (extra lossy) is not installed")
 
-STEADY = settings(max_examples=cases(200))
+STEADY = settings(max_examples=cases(100))
 CAP = 16 << 20
 STAMP_NS = 1_700_000_000_123_456_789
 ENCODINGS = (Encoding.ROS1, Encoding.CDR)
@@ -231,7 +231,7 @@ def mutated(draw: st.DrawFn) -> tuple[Codec, bytes]:
 
 
 @given(case=mutated() | st.tuples(st.sampled_from([Codec.DRACO, Codec.JPEG]), st.binary(max_size=300)))
-@settings(STEADY, max_examples=cases(500))
+@settings(STEADY, max_examples=cases(250))
 def test_any_bytes_decode_to_what_they_claim_or_raise_codec_error(case: tuple[Codec, bytes]) -> None:
     codec, body = case
     try:

@@ -77,7 +77,7 @@ def test_a_hundred_plain_subscribers_cost_a_robot_next_to_nothing(every_s: float
             world.network.after(0.02 + stays_s, lambda now: site.core.link.close("bye", now=now), node=site)
 
         world.network.after(0.1 + index * every_s, come)
-    world.run(20.0)
+    world.run(100 * every_s + stays_s + 3.0)
     cores = [client.core for client in world.clients.values()]
     assert not any(core.subscription.patterns for core in cores if core.name.startswith("site"))
     assert control.nbytes < ROBOT_BYTES, control.kinds
@@ -272,7 +272,7 @@ def in_stream(index: int) -> InStream:
 
 
 @pytest.mark.parametrize("batches", [True, False])
-@pytest.mark.parametrize("seed", seeds(20))
+@pytest.mark.parametrize("seed", seeds(10))
 def test_whatever_changes_the_peer_ends_up_with_what_is(seed: int, batches: bool) -> None:
     random = Random(seed)
     interest = Interest()

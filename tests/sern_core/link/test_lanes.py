@@ -15,7 +15,7 @@ from sern_sim.hop import Hop
 from sern_sim.models import LinkModel, RateStep, Window
 from tests.world import SimClient, World, spec
 
-RATE_BPS = 4e6
+RATE_BPS = 2e6
 
 
 def models(*blackouts: Window, loss: float = 0.0) -> tuple[LinkModel, LinkModel]:
@@ -28,7 +28,13 @@ class TwoLanes:
     """A robot that reaches the relay over both lanes, and a site beside the relay."""
 
     def __init__(
-        self, *, stream: LinkModel, datagrams: LinkModel, open_at_s: float = 1.0, link: LinkParams | None = None
+        self,
+        *,
+        stream: LinkModel,
+        datagrams: LinkModel,
+        open_at_s: float = 1.0,
+        link: LinkParams | None = None,
+        cloud_bytes: int = 50_000,
     ) -> None:
         self.world = World(link=link)
         self.robot = self.world.client("robot", stream)
@@ -40,7 +46,7 @@ class TwoLanes:
         self.logged = 0
         every = self.world.network.every
         every(0.02, lambda now: self.core.send(self.pose, b"p" * 100, 0, now=now), node=self.robot)
-        every(0.1, lambda now: self.core.send(self.cloud, b"c" * 100_000, 0, now=now), node=self.robot)
+        every(0.1, lambda now: self.core.send(self.cloud, b"c" * cloud_bytes, 0, now=now), node=self.robot)
         every(0.1, self._log, node=self.robot)
         self.world.network.at(open_at_s, self._open)
 
@@ -96,7 +102,10 @@ class ShortPath(TwoLanes):
         steps = () if slower_bps is None else (RateStep(8.0, slower_bps),)
         path = LinkModel(rate_bps=8e6, delay_s=0.002, rate_steps=steps)
         super().__init__(
-            stream=replace(path, loss=stream_loss).as_stream(), datagrams=path, link=LinkParams(stream_from_bps=3e6)
+            stream=replace(path, loss=stream_loss).as_stream(),
+            datagrams=path,
+            link=LinkParams(stream_from_bps=3e6),
+            cloud_bytes=100_000,
         )
         self.used: list[int] = []
         self.sizes: list[int] = []
@@ -162,11 +171,11 @@ def test_it_falls_back_when_datagrams_cease_and_returns_by_itself() -> None:
 
 
 def test_a_session_outlives_the_stream_and_a_fresh_pose_is_there_at_once() -> None:
-    stream, datagrams = models(Window(10.0, 24.0))  # the stream's connection breaks after 5 s of it
+    stream, datagrams = models(Window(5.0, 19.0))  # the stream's connection breaks after 5 s of it
     lanes = TwoLanes(stream=stream, datagrams=datagrams)
-    lanes.run(36.0)
+    lanes.run(27.0)
     assert lanes.robot.ups == [False]  # one session all along
-    assert lanes.first_pose_after(24.0) <= 0.3
+    assert lanes.first_pose_after(19.0) <= 0.3
     assert lanes.core.link.lanes.by_id[LANE_ZMQ].up
     lanes.check_log()
 
@@ -174,13 +183,13 @@ def test_a_session_outlives_the_stream_and_a_fresh_pose_is_there_at_once() -> No
 @pytest.mark.parametrize("end", ["robot", "relay"])
 def test_packet_numbers_of_the_datagram_lane_that_run_out_begin_another_session(end: str) -> None:
     lanes = TwoLanes(stream=models()[0], datagrams=models()[1])
-    lanes.run(5.0)
+    lanes.run(3.0)
     link = lanes.core.link if end == "robot" else lanes.world.relay.hub.links[ClientName("robot")]
     link.lanes.by_id[LANE_UDP].flight.next_number = framing.MAX_PACKET_NUMBER - 5
-    lanes.run(5.0)
+    lanes.run(3.0)
     assert lanes.robot.ups == [False, True]
     lanes._open(lanes.world.network.now)
-    lanes.run(5.0)
+    lanes.run(3.0)
     assert lanes.core.link.lane.id == LANE_UDP
     lanes.check_log()
 
@@ -261,7 +270,7 @@ def _poses_lost(redundancy: Redundancy) -> float:
         robot.core.send(pose, b"p" * 100, 0, now=now)
 
     world.network.at(2.0, lambda _now: world.network.every(0.02, offer, node=robot, first_s=2.0))
-    world.run(62.0)
+    world.run(32.0)
     world.validate()
     assert len({got.seq for got in site.on("/robot/pose")}) == len(site.on("/robot/pose"))
     return 1 - len(site.on("/robot/pose")) / len(offered)

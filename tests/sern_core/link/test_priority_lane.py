@@ -13,7 +13,7 @@ from sern_sim.hop import Hop
 from sern_sim.models import LinkModel, Window
 from tests.world import World, spec
 
-RATE_BPS = 4e6
+RATE_BPS = 2e6
 ROBOT = ClientName("robot")
 
 
@@ -45,7 +45,7 @@ class PriorityScene:
         self.commands = 0
         every = self.world.network.every
         every(0.02, lambda now: self.core.send(self.pose, b"p" * 100, 0, now=now), node=self.robot)
-        every(0.1, lambda now: self.core.send(self.cloud, b"c" * 100_000, 0, now=now), node=self.robot)
+        every(0.1, lambda now: self.core.send(self.cloud, b"c" * 50_000, 0, now=now), node=self.robot)
         every(0.1, self._command, node=self.robot)
         self.world.network.at(join_at_s, lambda _now: self.join())
 
@@ -243,7 +243,7 @@ def test_thirteen_times_as_much_class_control_as_the_path_carries_leaves_a_way_f
     flood = scene.robot.publish("/robot/flood", spec(PriorityClass.CONTROL, depth=10))
     scene.robot.every(1000 * 8 / (13 * RATE_BPS), flood, b"f" * 1000, first_s=2.0)
     scene.world.until(scene.used)
-    scene.run(10.0)
+    scene.run(6.0)
     assert scene.used()
     opened = len(scene.site.opened)
     scene.robot.publish("/robot/chat", spec(reliable=True), definition="string data")

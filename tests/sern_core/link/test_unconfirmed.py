@@ -18,7 +18,7 @@ from tests.world import World, spec
 TOPIC = "/robot/points"
 
 
-@settings(max_examples=cases(12), phases=(Phase.explicit, Phase.generate))
+@settings(max_examples=cases(8), phases=(Phase.explicit, Phase.generate))
 @given(
     loss=st.sampled_from([0.0, 0.05, 0.3]),
     jitter_s=st.sampled_from([0.0, 0.02]),

@@ -455,5 +455,5 @@ class RegistryMachine(RuleBasedStateMachine):
 def test_against_a_model() -> None:
     run_state_machine_as_test(
         RegistryMachine,
-        settings=settings(max_examples=cases(100), stateful_step_count=30),
+        settings=settings(max_examples=cases(60), stateful_step_count=30),
     )

@@ -203,7 +203,7 @@ def test_a_far_jump_of_numbers_costs_nothing() -> None:
     assert arrivals.mask == 0 and arrivals.highest == 0xFFFFFFFF
 
 
-@settings(max_examples=cases(200))
+@settings(max_examples=cases(120))
 @given(
     st.lists(st.integers(1, 40), max_size=60),
     st.integers(0, 2**16),

@@ -9,7 +9,7 @@ from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.types import ClientName, TopicName
 from tests.exploring import cases
 
-PURE = settings(max_examples=cases(100))
+PURE = settings(max_examples=cases(60))
 
 RULES = (
     AccessRule("operator", publish=("/.*/cmd_vel",), subscribe=(".*",), replay=("/map",)),

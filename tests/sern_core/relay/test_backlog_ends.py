@@ -34,7 +34,7 @@ def _access(*, forbidden: str = "") -> AccessTable:
     )
 
 
-@settings(max_examples=cases(40), phases=PHASES)
+@settings(max_examples=cases(24), phases=PHASES)
 @given(
     actions=st.lists(st.sampled_from(ACTIONS), min_size=4, max_size=60),
     end=st.sampled_from(ENDS),

@@ -241,7 +241,7 @@ def test_a_message_that_is_held_back_takes_nobodys_place() -> None:
     assert world.clients["site"].seqs("/points") == [2]
 
 
-@pytest.mark.parametrize("seed", seeds(8))
+@pytest.mark.parametrize("seed", seeds(5))
 def test_whatever_comes_the_bound_holds_and_nothing_is_lost_silently(seed: int) -> None:
     world = bounded_world().watch(0.5)
     robot, site = world.clients["robot"], world.clients["site"]
@@ -264,7 +264,8 @@ def test_whatever_comes_the_bound_holds_and_nothing_is_lost_silently(seed: int) 
     cancel = world.network.every(0.05, send, node=robot).cancel
     world.run(10.0)
     cancel()
-    world.run(60.0)
+    world.until(lambda: waiting(world) == 0)
+    world.run(1.0)
     for channel in channels:
         topic = channel.stream.id.topic
         sent = list(range(1, channel.next_seq))

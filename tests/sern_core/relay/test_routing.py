@@ -507,5 +507,5 @@ class SlicedMachine(RoutingMachine):
 def test_against_brute_force(machine: type[RoutingMachine]) -> None:
     run_state_machine_as_test(
         machine,
-        settings=settings(max_examples=cases(60), stateful_step_count=30),
+        settings=settings(max_examples=cases(40), stateful_step_count=30),
     )

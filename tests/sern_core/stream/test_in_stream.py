@@ -85,7 +85,7 @@ def _body(seq: int, total: int) -> bytes:
     return (b"%08d" % seq * (total // 8 + 1))[:total]
 
 
-@settings(max_examples=cases(200))
+@settings(max_examples=cases(120))
 @given(st.data())
 def test_pieces_in_any_order_repeated_and_overlapping(data: st.DataObject) -> None:
     total = data.draw(st.integers(2, 300))
@@ -101,7 +101,7 @@ def test_pieces_in_any_order_repeated_and_overlapping(data: st.DataObject) -> No
     assert receiver.room.held_bytes == 0
 
 
-@settings(max_examples=cases(200))
+@settings(max_examples=cases(120))
 @given(st.lists(st.tuples(st.integers(1, 20), st.booleans()), max_size=60))
 def test_reliable_is_once_and_in_order_best_effort_rises(arrivals: list[tuple[int, bool]]) -> None:
     reliable, best = Receiver(reliable=True), Receiver()
@@ -252,7 +252,7 @@ def test_many_half_received_messages_are_left_out_in_slices() -> None:
     assert receiver.seqs == list(range(1999, 1000 + count, 1000))
 
 
-@settings(max_examples=cases(100), deadline=None)
+@settings(max_examples=cases(60), deadline=None)
 @given(st.lists(st.tuples(st.integers(1, 40), st.sampled_from(["whole", "piece", "first"])), max_size=40))
 def test_skipping_whatever_has_arrived(steps: list[tuple[int, str]]) -> None:
     receiver = Receiver(reliable=True)

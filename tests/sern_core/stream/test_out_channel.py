@@ -201,7 +201,7 @@ class Channel(RuleBasedStateMachine):
 TestChannel = Channel.TestCase
 
 
-TestChannel.settings = settings(max_examples=cases(75), stateful_step_count=40)
+TestChannel.settings = settings(max_examples=cases(50), stateful_step_count=40)
 
 
 @pytest.mark.parametrize("reliable", [False, True])

@@ -277,7 +277,7 @@ def test_lower_classes_never_pass_a_closed_window() -> None:
     assert scheduler.next_deadline(now=T0, window_open=False) is None
 
 
-@settings(max_examples=cases(100))
+@settings(max_examples=cases(60))
 @given(
     rates=st.lists(st.none() | st.floats(0, 1e8), min_size=1, max_size=5),
     steps=st.lists(st.tuples(st.integers(0, 5000), st.floats(0, 0.1)), min_size=1, max_size=40),
@@ -345,7 +345,7 @@ def test_no_topic_starves_within_its_class() -> None:
     assert set(traffic.order[-5_000:]) == set(sizes)
 
 
-@settings(max_examples=cases(100))
+@settings(max_examples=cases(60))
 @given(
     sizes=st.lists(st.integers(1, 10_000), min_size=1, max_size=40),
     weights=st.lists(st.floats(0.1, 10.0), min_size=40, max_size=40),
@@ -380,7 +380,7 @@ def test_equals_are_served_oldest_first_without_ageing(count: int) -> None:
     assert served == list(range(count)) * 3
 
 
-@settings(max_examples=cases(100))
+@settings(max_examples=cases(60))
 @given(
     messages=st.lists(
         st.tuples(st.sampled_from(CLASSES), st.integers(100, 2_000), st.floats(0, 40)), min_size=1, max_size=40

@@ -213,4 +213,4 @@ class SchedulerMachine(RuleBasedStateMachine):
 
 
 TestSchedulerMachine = SchedulerMachine.TestCase
-TestSchedulerMachine.settings = settings(max_examples=cases(75), stateful_step_count=40)
+TestSchedulerMachine.settings = settings(max_examples=cases(50), stateful_step_count=40)

@@ -89,7 +89,7 @@ messages = st.builds(
 )
 
 
-@settings(max_examples=cases(100))
+@settings(max_examples=cases(60))
 @given(rounds=st.lists(st.lists(messages, max_size=12), min_size=1, max_size=5))
 def test_each_interval_does_what_the_algorithm_says(rounds: list[list[Pending]]) -> None:
     scheduler = paper_scheduler()

@@ -295,7 +295,7 @@ def test_what_waits_is_bounded() -> None:
     assert len(rebuilder._waiting) == 1024
 
 
-@settings(max_examples=cases(150))
+@settings(max_examples=cases(80))
 @given(st.data(), st.sampled_from(scenes.ENCODINGS))
 def test_with_losses_only_true_grids_are_shown_and_the_next_keyframe_converges(
     data: st.DataObject, encoding: Encoding

@@ -42,7 +42,7 @@ def check(site: SimClient, robot: SimClient, topic: str) -> None:
 
 
 def test_auto_compresses_where_the_link_is_slower_than_the_codec() -> None:
-    fast = LinkModel(rate_bps=100e6, delay_s=0.005).as_stream()
+    fast = LinkModel(rate_bps=25e6, delay_s=0.005).as_stream()
     for model, packed in ((THIN, True), (fast, False)):
         world = World(compress=True).watch()
         robot, site = pair(world, robot=model)
@@ -52,8 +52,8 @@ def test_auto_compresses_where_the_link_is_slower_than_the_codec() -> None:
         world.run(2.0)
         robot.every(0.05, log, lambda seq: text(seq, 20_000))
         if not packed:
-            robot.every(0.01, filler, bytes(140_000))  # keeps the link busy, so that its rate is known
-        world.run(20.0 if packed else 6.0)
+            robot.every(0.01, filler, bytes(35_000))  # keeps the link busy, so that its rate is known
+        world.run(12.0 if packed else 5.0)
         check(site, robot, "/robot/log")
         assert log.codec is not None
         assert (log.codec.mode is not Compression.NONE) is packed
@@ -61,7 +61,7 @@ def test_auto_compresses_where_the_link_is_slower_than_the_codec() -> None:
         assert {bool(message.codec) for message in latest} == {packed}
         if packed:  # 3.2 Mbit/s of text over 1 Mbit/s
             assert log.codec.ratio < 0.4
-            assert len(site.got) >= 380, "compression made room for all of it"
+            assert len(site.got) >= 228, "compression made room for all of it"
 
 
 @pytest.mark.parametrize("lossless", [True, False])
@@ -141,10 +141,10 @@ def test_a_topic_faster_than_its_codec_still_gets_through() -> None:
     cloud = robot.publish("/robot/points", spec(PriorityClass.BULK, compression=Compression.LZ4))
     world.run(1.0)
     robot.every(0.02, cloud, lambda seq: text(seq, 100_000))  # encoded in 50 ms each
-    world.run(20.0)
+    world.run(12.0)
     check(site, robot, "/robot/points")
-    assert len(site.got) >= 40  # about 30 kB each over 125 kB/s
-    assert cloud.counters.by_reason[DropReason.SUPERSEDED] > 100
+    assert len(site.got) >= 24  # about 30 kB each over 125 kB/s
+    assert cloud.counters.by_reason[DropReason.SUPERSEDED] > 60
 
 
 def test_others_go_while_a_body_is_encoded() -> None:

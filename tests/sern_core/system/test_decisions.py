@@ -170,10 +170,10 @@ def capacity() -> tuple[TraceRecord, ...]:
 
 @cache
 def levels() -> tuple[TraceRecord, ...]:
-    """A link of 1 Mbit/s and then ten, for clouds of 300 kB."""
+    """A link of 0.5 Mbit/s and then ten times that, for clouds of 150 kB."""
     world = World(lossless=False)
-    robot, _site = pair(world, LinkModel(delay_s=0.025, rate_bps=1e6, rate_steps=(RateStep(3.0, 10e6),)))
-    clouds = FittedTopic(robot, "/robot/points", 300_000, 8_000, 10.0)
+    robot, _site = pair(world, LinkModel(delay_s=0.025, rate_bps=0.5e6, rate_steps=(RateStep(3.0, 5e6),)))
+    clouds = FittedTopic(robot, "/robot/points", 150_000, 8_000, 10.0)
     world.run(20.0)
     assert clouds.fit.level is SummaryLevel.RAW
     return records(robot, LINK)

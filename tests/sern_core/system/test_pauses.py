@@ -126,7 +126,7 @@ class Scene:
             number += 1
             # A long pause is looked through in steps of a tick of the others.
             coarse = self.begins_s + 1.0 < self.t < self.ends_s - 0.3
-            self.t += min(0.25, self.ends_s - 0.2 - self.t) if coarse else STEP_S
+            self.t += min(0.5, self.ends_s - 0.2 - self.t) if coarse else STEP_S
             self.turn(number * 100 + 3 if coarse else number)
         return self
 

@@ -9,13 +9,13 @@ from tests.world import limited
 PHASES = (Phase.explicit, Phase.generate)  # a scenario reads well as it is; making it smaller takes minutes
 
 
-@settings(max_examples=cases(30), phases=PHASES)
+@settings(max_examples=cases(20), phases=PHASES)
 @given(scenarios())
 def test_promises_hold_in_any_world(scenario: Scenario) -> None:
     Run(scenario).play().check()
 
 
-@settings(max_examples=cases(25), phases=PHASES)
+@settings(max_examples=cases(12), phases=PHASES)
 @given(scenarios())
 def test_promises_hold_when_work_goes_in_slices_everywhere(scenario: Scenario) -> None:
     """What is through in one slice in so small a world is cut after a message or two here."""

@@ -99,8 +99,8 @@ def test_no_class_starves_and_each_has_its_share() -> None:
     """Every class alone would fill the link twice: class 0 gets its bucket's half, bulk its tenth, state the rest."""
     world = World().watch()
     _, _, channels, tap = overloaded(world, dict.fromkeys(CLASSES, 2e6))
-    world.run(20.0)
-    got = shares(tap, channels, world.now - 15.0)
+    world.run(14.0)
+    got = shares(tap, channels, world.now - 10.0)
     assert got[PriorityClass.CONTROL] == pytest.approx(0.5, abs=0.07)
     assert got[PriorityClass.BULK] == pytest.approx(0.1, abs=0.03)
     assert got[PriorityClass.STATE] == pytest.approx(0.4, abs=0.08)
@@ -112,10 +112,10 @@ def test_below_its_bucket_class_0_waits_for_nobody() -> None:
     _, site, channels, tap = overloaded(
         world, {PriorityClass.CONTROL: 300e3, PriorityClass.STATE: 2e6, PriorityClass.BULK: 2e6}, size=1_000
     )
-    world.run(20.0)
-    got = shares(tap, channels, world.now - 15.0)
+    world.run(12.0)
+    got = shares(tap, channels, world.now - 8.0)
     assert got[PriorityClass.CONTROL] >= 0.25 and got[PriorityClass.BULK] == pytest.approx(0.1, abs=0.03)
-    ages = sorted(g.age_s for g in site.on("/robot/control") if g.at_s > world.now - 15.0)
+    ages = sorted(g.age_s for g in site.on("/robot/control") if g.at_s > world.now - 8.0)
     assert ages[int(0.99 * len(ages))] < 0.025 + 0.06
     assert channels[PriorityClass.CONTROL].counters.dropped == 0
 
@@ -124,9 +124,9 @@ def test_a_class_that_is_alone_has_the_whole_link() -> None:
     for priority in CLASSES:
         world = World().watch()
         overloaded(world, {priority: 2e6})
-        world.run(4.0)
+        world.run(3.0)
         before = world.hops["robot"].forward.stats
-        world.run(10.0)
+        world.run(5.0)
         assert world.hops["robot"].forward.stats.minus(before).utilisation > 0.85, priority.name
 
 
@@ -208,8 +208,8 @@ def test_a_command_is_never_late_whatever_the_clocks(
             delay_s=delay_s,
             jitter_s=0.02,
             loss=0.0 if lossless else 0.05,
-            rate_steps=(RateStep(8.0, 60e3), RateStep(14.0, 500e3)),
-            blackouts=(Window(10.0, 10.4), Window(16.0, 20.0)),
+            rate_steps=(RateStep(5.0, 60e3), RateStep(9.0, 500e3)),
+            blackouts=(Window(7.0, 7.4), Window(10.0, 13.0)),
         )
         return made.as_stream() if lossless else made
 
@@ -218,10 +218,10 @@ def test_a_command_is_never_late_whatever_the_clocks(
     robot = world.client("robot", slow if asymmetric else quick, quick, clock=clocks[2], patterns=["/robot/cmd_vel"])
     command = desk.publish("/robot/cmd_vel", spec(PriorityClass.CONTROL, lifespan_s=0.3))
     cloud = desk.publish("/robot/cloud", spec(PriorityClass.BULK))
-    world.run(5.0)
+    world.run(3.0)
     desk.every(0.02, command, bytes(100))
     desk.every(0.2, cloud, bytes(20_000))
-    world.run(20.0)
+    world.run(12.0)
     ages = [got.at_s - desk.sent["/robot/cmd_vel", got.seq][0] for got in robot.got]
     assert len(ages) > 100 and max(ages) <= 0.3 * 1.0002
     for got in robot.got:
@@ -231,14 +231,14 @@ def test_a_command_is_never_late_whatever_the_clocks(
 
 def test_a_stall_is_found_and_probed_with_fresh_poses_and_the_first_after_it_is_fresh() -> None:
     world = World(lossless=False).watch()
-    robot = world.client("robot", LinkModel(rate_bps=1e6, delay_s=0.025, blackouts=(Window(5.0, 15.0),)))
+    robot = world.client("robot", LinkModel(rate_bps=1e6, delay_s=0.025, blackouts=(Window(4.0, 12.0),)))
     site = world.client("site", patterns=["/robot/.*"])
     pose = robot.publish("/robot/odom", spec(PriorityClass.CONTROL))
     cloud = robot.publish("/robot/cloud", spec(PriorityClass.BULK))
     world.run(2.0)
     robot.every(0.02, pose, bytes(100))
     robot.every(0.05, cloud, bytes(10_000))
-    world.run(5.01)  # not between a probe and its copy
+    world.run(3.01)  # not between a probe and its copy
     link = robot.core.link
     assert [link.lane.stalled, link.lane.estimator.rate_bps] == [True, None]
     tap = Tap(robot)
@@ -248,13 +248,13 @@ def test_a_stall_is_found_and_probed_with_fresh_poses_and_the_first_after_it_is_
     first_at_s = {probe.seq: probe.at_s for probe in reversed(probes)}  # a copy may follow
     assert all(at_s - robot.sent["/robot/odom", seq][0] < 0.021 for seq, at_s in first_at_s.items())
     assert not list(tap.of(cloud)), "nothing else"
-    world.run(4.0)
-    came_back_s = world.network.start_s + 15.0
+    world.run(3.0)
+    came_back_s = world.network.start_s + 12.0
     first = next(got for got in site.got if got.at_s > came_back_s)
     assert first.topic == "/robot/odom" and first.at_s - came_back_s < 0.2 and first.age_s < 0.06
-    world.run(10.0)
+    world.run(6.0)
     assert not link.lane.stalled
-    assert len([g for g in site.on("/robot/cloud") if g.at_s > world.now - 5.0]) >= 40
+    assert len([g for g in site.on("/robot/cloud") if g.at_s > world.now - 3.0]) >= 24
 
 
 def test_the_papers_ordering_end_to_end() -> None:
@@ -356,9 +356,9 @@ def test_a_client_above_its_limit_is_held_to_it_and_told() -> None:
     log = robot.publish("/robot/log", spec(reliable=True))
     world.run(2.0)
     robot.every(0.01, log, b"x")
-    world.run(10.0)
+    world.run(5.0)
     delivered, expired = site.seqs("/robot/log"), site.expired_seqs["/robot/log"]
-    assert 150 <= len(delivered) <= 300
+    assert 75 <= len(delivered) <= 150
     assert site.turns[log.stream.id] == list(range(1, len(delivered) + len(expired) + 1))
     dropped = {drop.seq for drop in robot.dropped_out}
     assert {drop.reason for drop in robot.dropped_out} == {DropReason.RATE_CAP}
@@ -387,12 +387,12 @@ def test_nothing_grows_while_clients_come_and_go() -> None:
     channels = [robot.publish(f"/robot/t{n}", spec(reliable=bool(n % 2), latched=n > 2, depth=3)) for n in range(4)]
     for channel in channels:
         robot.every(0.1, channel, bytes(500))
-    for _ in range(10):
-        world.run(5.0)
+    for _ in range(6):
+        world.run(3.0)
         world.hops["site"].break_connection()
-        world.run(3.0)
+        world.run(2.0)
         site = world.restart_client("site")
-        world.run(3.0)
+        world.run(2.0)
         world.restart_relay()
     world.run(10.0)
     assert len(site.opened) == 4

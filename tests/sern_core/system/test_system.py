@@ -35,12 +35,12 @@ def test_pose_stays_fresh_under_overload() -> None:
     cloud = robot.publish("/robot/points", spec(PriorityClass.BULK))
     world.network.every(0.02, lambda now: robot.core.send(pose, b"p" * 100, 0, now=now), node=robot)
     world.network.every(0.1, lambda now: robot.core.send(cloud, b"c" * 100_000, 0, now=now), node=robot)
-    world.run(20.0)
+    world.run(12.0)
     late = [got for got in site.on("/robot/odom") if got.at_s - world.network.start_s > 2.0]
     ages = sorted(got.age_s for got in late)
-    assert len(late) >= 0.95 * 50 * 18
+    assert len(late) >= 0.95 * 50 * 10
     assert ages[int(len(ages) * 0.99)] < 0.060
-    assert len(site.on("/robot/points")) >= 20 * 4 * 0.8  # of the 5 a second that fit
+    assert len(site.on("/robot/points")) >= 12 * 4 * 0.8  # of the 5 a second that fit
     world.validate()
 
 
@@ -69,7 +69,7 @@ def test_reliable_survives_a_relay_restart_once_and_in_order(lossless: bool) -> 
     world.validate()
 
 
-@pytest.mark.parametrize(("size", "rate_bps"), [(100, 0.25e6), (700, 1e6), (2000, 1e6)])
+@pytest.mark.parametrize(("size", "rate_bps"), [(100, 0.125e6), (700, 0.25e6), (2000, 0.25e6)])
 @pytest.mark.parametrize("lossless", [True, False])
 def test_thirteen_times_as_much_class_control_as_the_link_carries_leaves_a_way_for_what_must_be_said(
     lossless: bool, size: int, rate_bps: float
@@ -81,7 +81,7 @@ def test_thirteen_times_as_much_class_control_as_the_link_carries_leaves_a_way_f
     site = world.client("site", patterns=["/robot/.*"])
     pose = robot.publish("/robot/pose", spec(PriorityClass.CONTROL, depth=10))
     robot.every(size * 8 / (13 * rate_bps), pose, b"p" * size)
-    world.run(15.0)  # what was sent before the link's capacity was known has left its queue
+    world.run(10.0)  # what was sent before the link's capacity was known has left its queue
     robot.publish("/robot/chat", spec(reliable=True), definition="string data")
     world.until(lambda: len(site.opened) == 2, within_s=2.0, what="the site hears of another stream")
     world.validate()

@@ -12,7 +12,7 @@ from sern_core.topics.patterns import MAX_CLIENT_PROGRAM, MAX_PROGRAM, PatternEr
 from sern_core.vocabulary.errors import UsageError
 from tests.exploring import cases
 
-PURE = settings(max_examples=cases(150))
+PURE = settings(max_examples=cases(80))
 
 
 @pytest.mark.parametrize(

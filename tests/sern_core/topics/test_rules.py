@@ -35,7 +35,7 @@ from sern_core.vocabulary.names import (
 from sern_core.vocabulary.types import Durability, Encoding, PriorityClass, Reliability, TopicName
 from tests.exploring import cases
 
-STEADY = settings(max_examples=cases(100))
+STEADY = settings(max_examples=cases(60))
 PARTS = st.from_regex(r"[A-Za-z_][A-Za-z0-9_]{0,5}", fullmatch=True)
 NAMES = st.lists(PARTS, min_size=1, max_size=4).map(lambda parts: TopicName("/" + "/".join(parts)))
 FEW_NAMES = st.sampled_from([TopicName(name) for name in ("/a", "/b", "/a/b", "/odom", "/tf")])

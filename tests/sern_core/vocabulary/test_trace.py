@@ -11,7 +11,7 @@ from sern_core.vocabulary.trace import LINK, OTHER, RECORD_BYTES, DecisionTrace,
 from sern_core.vocabulary.types import DropReason, TopicName
 from tests.exploring import cases
 
-PURE = settings(max_examples=cases(100))
+PURE = settings(max_examples=cases(60))
 ODOM, MAP = TopicName("/odom"), TopicName("/map")
 
 

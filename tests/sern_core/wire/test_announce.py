@@ -29,7 +29,7 @@ from sern_core.wire.announce import (
 )
 from tests.exploring import cases
 
-STEADY = settings(max_examples=cases(200))
+STEADY = settings(max_examples=cases(100))
 NAMES = st.from_regex(r"\A[a-z][a-z0-9_]{0,62}\Z")
 TOPICS = st.from_regex(r"\A/[A-Za-z_][A-Za-z0-9_]{0,40}(/[a-z0-9_]{1,40}){0,4}\Z")
 PRINTABLE = st.text(max_size=60).filter(str.isprintable)

@@ -18,7 +18,7 @@ from sern_core.wire import framing
 from tests.exploring import cases
 from tests.make_vectors import Frames
 
-STEADY = settings(max_examples=cases(200))
+STEADY = settings(max_examples=cases(100))
 U8, U16, U32, U64 = (st.integers(0, 2**bits - 1) for bits in (8, 16, 32, 64))
 HEADER = framing.encode_header(framing.Kind.DATA, 7, 1, 0)
 

@@ -3,6 +3,7 @@
 Times are those of the simulated network, so they are the same on every machine and may be asserted.
 """
 
+from functools import cache
 from math import inf
 
 import pytest
@@ -44,20 +45,20 @@ def run(model: LinkModel, until_s: float, *, seed: int = 1, tick_s: float = 0.0,
 @pytest.mark.parametrize("seed", [1, *also(2)])
 @pytest.mark.parametrize("tick_s", [0.0, 0.001])
 def test_a_saturated_link_hardly_delays_a_pose(seed: int, tick_s: float) -> None:
-    world = run(link(4e6, 0.05), 20.0, seed=seed, tick_s=tick_s)
+    world = run(link(4e6, 0.05), 14.0, seed=seed, tick_s=tick_s)
     poses, floor = world.poses_ms(5.0), floor_ms(4e6, 0.05)
     assert at(poses, 0.5) < 1.10 * floor
     assert at(poses, 0.99) < 1.25 * floor
-    assert world.goodput_bps(5.0, 20.0) > 0.97 * carries_bps(4e6)
+    assert world.goodput_bps(5.0, 14.0) > 0.97 * carries_bps(4e6)
     assert world.hop.forward.stats.queue_drops == 0
 
 
 def test_a_stream_with_fragments_of_3_ms() -> None:
-    world = run(link(4e6, 0.05).as_stream(), 20.0)
+    world = run(link(4e6, 0.05).as_stream(), 14.0)
     poses, floor = world.poses_ms(5.0), floor_ms(4e6, 0.05)
     assert at(poses, 0.5) < 1.15 * floor
     assert at(poses, 0.99) < 1.3 * floor
-    assert world.goodput_bps(5.0, 20.0) > 0.96 * carries_bps(4e6)
+    assert world.goodput_bps(5.0, 14.0) > 0.96 * carries_bps(4e6)
 
 
 @pytest.mark.parametrize(
@@ -66,56 +67,69 @@ def test_a_stream_with_fragments_of_3_ms() -> None:
 )
 def test_loss_on_the_path_is_not_a_full_link(change: dict[str, float], loss: float) -> None:
     model = LinkModel(rate_bps=4e6, delay_s=0.025, overhead_bytes=60, **change)  # type: ignore[arg-type]
-    world = run(model, 20.0)
-    assert world.goodput_bps(5.0, 20.0) > 0.92 * (1 - loss) * carries_bps(4e6)
+    world = run(model, 14.0)
+    assert world.goodput_bps(5.0, 14.0) > 0.92 * (1 - loss) * carries_bps(4e6)
     assert at(world.poses_ms(5.0), 0.99) < 1.35 * floor_ms(4e6, 0.05)
 
 
 def test_jitter_costs_little_of_the_link() -> None:
     model = LinkModel(rate_bps=4e6, delay_s=0.025, jitter_s=0.005, overhead_bytes=60)
-    world = run(model, 30.0)
-    assert world.goodput_bps(5.0, 30.0) > 0.85 * carries_bps(4e6)
+    world = run(model, 20.0)
+    assert world.goodput_bps(5.0, 20.0) > 0.85 * carries_bps(4e6)
     assert at(world.poses_ms(5.0), 0.99) < 3 * floor_ms(4e6, 0.05)
 
 
+@cache
+def long_fast_path() -> World:
+    """Two tests look at it, and change nothing."""
+    return run(link(20e6, 0.2), 14.0)
+
+
 def test_a_long_fast_path_is_filled_without_a_queue() -> None:
-    world = run(link(20e6, 0.2), 20.0)
-    assert world.goodput_bps(8.0, 20.0) > 0.94 * carries_bps(20e6)
+    world = long_fast_path()
+    assert world.goodput_bps(8.0, 14.0) > 0.94 * carries_bps(20e6)
     assert at(world.poses_ms(8.0), 0.99) < 1.3 * floor_ms(20e6, 0.2)
 
 
 @pytest.mark.parametrize(("rate_bps", "rtt_s"), [(0.25e6, 0.05), (1e6, 0.005), (1e6, 1.0), (20e6, 0.005), (20e6, 0.2)])
 def test_links_of_all_kinds(rate_bps: float, rtt_s: float) -> None:
-    begin_s = 8.0 + 15 * rtt_s
-    end_s = begin_s + 8.0 + 8 * rtt_s
-    world = run(link(rate_bps, rtt_s), end_s)
+    begin_s = 4.0 + 15 * rtt_s
+    end_s = begin_s + 4.0 + 8 * rtt_s
+    world = long_fast_path() if (rate_bps, rtt_s) == (20e6, 0.2) else run(link(rate_bps, rtt_s), end_s)
     assert world.goodput_bps(begin_s, end_s) > 0.88 * carries_bps(rate_bps)
     # One datagram may be on the wire when the pose comes.
     limit_ms = max(30.0, 500 * rtt_s) + 8e3 * 1260 / rate_bps
     assert at(world.poses_ms(begin_s), 0.99) - floor_ms(rate_bps, rtt_s) < 1.15 * limit_ms
 
 
-@pytest.mark.parametrize("off_s", [0.0, 0.013, 0.37])
-@pytest.mark.parametrize("tick_s", [0.0, 0.001])
+@pytest.mark.parametrize(
+    ("off_s", "tick_s"),
+    [(0.0, 0.0), (0.013, 0.001), (0.37, 0.0), (0.37, 0.001), *also((0.0, 0.001), (0.013, 0.0))],
+)
 def test_the_estimate_follows_the_capacity(off_s: float, tick_s: float) -> None:
-    down_s, up_s = 6.0 + off_s, 12.0 + off_s
+    down_s, up_s = 4.0 + off_s, 8.0 + off_s
     model = LinkModel(
         rate_bps=8e6, delay_s=0.025, overhead_bytes=60, rate_steps=(RateStep(down_s, 1e6), RateStep(up_s, 4e6))
     )
-    world = run(model, 18.0, tick_s=tick_s)
-    for from_s, to_s, rate_bps, within_s in ((down_s, up_s, 1e6, 0.5), (up_s, 18.0, 4e6, 0.6)):
+    world = run(model, 12.0, tick_s=tick_s)
+    for from_s, to_s, rate_bps, within_s in ((down_s, up_s, 1e6, 0.5), (up_s, 12.0, 4e6, 0.6)):
         off = [t for t, rate in world.rates() if from_s <= t < to_s and not 0.75 * rate_bps <= rate <= 1.25 * rate_bps]
         assert off[-1] - from_s < within_s
 
 
-@pytest.mark.parametrize(("rate_bps", "faster_bps"), [(1e6, 2e6), (2e6, 8e6), (4e6, 20e6)])
-@pytest.mark.parametrize("tick_s", [0.0, 0.001])
+@pytest.mark.parametrize(
+    ("rate_bps", "faster_bps", "tick_s"),
+    [
+        (1e6, 2e6, 0.0), (1e6, 2e6, 0.001), (2e6, 8e6, 0.001), (4e6, 20e6, 0.0),
+        *also((2e6, 8e6, 0.0), (4e6, 20e6, 0.001)),
+    ],
+)  # fmt: skip
 def test_a_link_that_gets_faster_is_found_by_packets_that_come_sooner(
     rate_bps: float, faster_bps: float, tick_s: float
 ) -> None:
-    up_s = 6.1
+    up_s = 4.1
     model = LinkModel(rate_bps=rate_bps, delay_s=0.025, overhead_bytes=60, rate_steps=(RateStep(up_s, faster_bps),))
-    world = run(model, 9.0, tick_s=tick_s)
+    world = run(model, 7.0, tick_s=tick_s)
     off = [t for t, rate in world.rates() if t >= up_s and not 0.75 * faster_bps <= rate <= 1.25 * faster_bps]
     assert off[-1] - up_s < 0.6
     assert at(world.poses_ms(up_s, up_s + 2.0), 0.99) < 3.0 * floor_ms(rate_bps, 0.05)
@@ -123,15 +137,15 @@ def test_a_link_that_gets_faster_is_found_by_packets_that_come_sooner(
 
 def test_a_link_that_gets_faster_shows_in_what_little_is_sent_and_nothing_else_does() -> None:
     model = LinkModel(
-        rate_bps=40e6, delay_s=0.005, overhead_bytes=60, rate_steps=(RateStep(3.0, 0.3e6), RateStep(30.0, 40e6))
+        rate_bps=40e6, delay_s=0.005, overhead_bytes=60, rate_steps=(RateStep(1.0, 0.3e6), RateStep(28.0, 40e6))
     )
     world = World(model, seed=1)
     estimator = HybridWindow()
-    world.flow(estimator, stop_s=12.0)  # from then on only poses
-    world.run(29.9)
+    world.flow(estimator, stop_s=10.0)  # from then on only poses
+    world.run(27.9)
     assert estimator.eased_s == -inf
-    world.run(30.5)
-    assert 0.0 < estimator.eased_s - world.network.start_s - 30.0 < 0.3
+    world.run(28.5)
+    assert 0.0 < estimator.eased_s - world.network.start_s - 28.0 < 0.3
 
 
 @pytest.mark.parametrize("gap_s", [10.0, 30.0])
@@ -151,12 +165,12 @@ def test_start_up_on_a_long_path() -> None:
 
 
 def test_two_flows_share_alike() -> None:
-    for rate_bps, rtt_s in ((4e6, 0.05), (10e6, 0.04)):
+    for rate_bps, rtt_s in ((4e6, 0.05), (8e6, 0.04)):
         world = World(link(rate_bps, rtt_s))
         world.flow(HybridWindow())
         world.flow(HybridWindow(), poses=False, start_s=2.0)
-        world.run(30.0)
-        one, two = (world.goodput_bps(10.0, 30.0, index) for index in (0, 1))
+        world.run(20.0)
+        one, two = (world.goodput_bps(10.0, 20.0, index) for index in (0, 1))
         assert (one + two) ** 2 / (2 * (one**2 + two**2)) > 0.9
 
 
@@ -165,8 +179,8 @@ def test_a_rival_that_fills_the_queue_starves_nobody(rival: type[CapacityEstimat
     world = World(link(4e6, 0.05))
     world.flow(HybridWindow())
     world.flow(rival(), poses=False, start_s=3.0)
-    world.run(40.0)
-    ours, theirs = (world.goodput_bps(20.0, 40.0, index) for index in (0, 1))
+    world.run(30.0)
+    ours, theirs = (world.goodput_bps(15.0, 30.0, index) for index in (0, 1))
     assert 0.15 < ours / (ours + theirs) < 0.85
 
 
@@ -177,10 +191,10 @@ def test_when_the_rival_leaves_the_queue_goes() -> None:
     world.flow(Cubic(), poses=False, start_s=2.0, stop_s=15.0)
     world.run(14.0)
     assert at(world.poses_ms(8.0, 14.0), 0.5) > 100.0  # its queue, whoever waits in it
-    world.run(40.0)
+    world.run(36.0)
     assert estimator.snapshot()["competing"] == 0.0
     assert at(world.poses_ms(30.0), 0.99) < 1.35 * floor_ms(4e6, 0.05)
-    assert world.goodput_bps(30.0, 40.0) > 0.94 * carries_bps(4e6)
+    assert world.goodput_bps(30.0, 36.0) > 0.94 * carries_bps(4e6)
 
 
 def test_poses_alone_for_minutes_then_overload() -> None:
@@ -211,9 +225,9 @@ def test_a_saturated_way_back_is_no_queue_of_ours() -> None:
     back = LinkModel(rate_bps=0.5e6, delay_s=0.025, overhead_bytes=60)
     world = World(link(20e6, 0.05), back)
     world.flow(HybridWindow(), thin=True)
-    world.run(15.0)
+    world.run(11.0)
     assert at(world.poses_ms(5.0), 0.99) < 1.4 * floor_ms(20e6, 0.05)
-    assert world.goodput_bps(5.0, 15.0) > 0.85 * carries_bps(20e6)
+    assert world.goodput_bps(5.0, 11.0) > 0.85 * carries_bps(20e6)
 
 
 def ack(estimator: HybridWindow, now: float, rtt_s: float, cum_bytes: int, *, behind_s: float = 0.0) -> None:
@@ -303,8 +317,8 @@ def test_another_route_is_not_taken_for_a_queue_for_ever(rtt_s: float, longer_s:
         path._delay_ns += round(longer_s * 1e9)
 
     world.network.at(8.0, reroute)
-    world.run(24.0)
-    assert world.goodput_bps(14.0, 24.0) > 0.9 * carries_bps(4e6)
+    world.run(20.0)
+    assert world.goodput_bps(14.0, 20.0) > 0.9 * carries_bps(4e6)
     assert at(world.poses_ms(14.0), 0.99) < 1e3 * (rtt_s / 2 + longer_s) + 15.0
 
 

@@ -13,7 +13,7 @@ from tests.exploring import also
 from tests.sern_core.path.congestion.test_hybrid import at, carries_bps
 
 DELAY_S = 0.030
-BACK_S = 12.0
+BACK_S = 9.0
 FIVE_S = 5.0
 
 
@@ -41,8 +41,8 @@ def run(model: LinkModel, until_s: float, seed: int) -> World:
 @pytest.mark.parametrize(
     ("jitter_s", "seed"),
     [
-        (0.0, 1), (0.002, 1), (0.005, 1), (0.005, 2), (0.005, 3), (0.010, 1), (0.010, 2),
-        *also((0.0, 2), (0.0, 3), (0.002, 2), (0.002, 3), (0.010, 3)),
+        (0.0, 1), (0.002, 1), (0.005, 2), (0.005, 3), (0.010, 1),
+        *also((0.0, 2), (0.0, 3), (0.002, 2), (0.002, 3), (0.005, 1), (0.010, 2), (0.010, 3)),
     ],
 )  # fmt: skip
 def test_a_link_that_was_thin_is_filled_again(jitter_s: float, seed: int) -> None:
@@ -50,13 +50,13 @@ def test_a_link_that_was_thin_is_filled_again(jitter_s: float, seed: int) -> Non
     assert world.goodput_bps(BACK_S + FIVE_S, BACK_S + FIVE_S + 2.0) > 0.9 * carries_bps(8e6)
 
 
-@pytest.mark.parametrize("jitter_s", [0.0, 0.002, 0.005, 0.010, 0.020])
+@pytest.mark.parametrize("jitter_s", [0.0, 0.005, 0.020, *also(0.002, 0.010)])
 def test_a_link_that_was_gone_is_filled_again(jitter_s: float) -> None:
     world = run(link(8e6, jitter_s, gone=True), BACK_S + FIVE_S + 2.0, 1)
     assert world.goodput_bps(BACK_S + FIVE_S, BACK_S + FIVE_S + 2.0) > 0.85 * carries_bps(8e6)
 
 
-@pytest.mark.parametrize(("rate_bps", "thin_bps"), [(4e6, 0.6e6), (20e6, 0.6e6), (20e6, 2e6)])
+@pytest.mark.parametrize(("rate_bps", "thin_bps"), [(4e6, 0.6e6), (16e6, 0.6e6), *also((16e6, 2e6))])
 def test_rates_of_all_kinds_are_found_again(rate_bps: float, thin_bps: float) -> None:
     world = run(link(rate_bps, 0.005, thin_bps=thin_bps), BACK_S + FIVE_S + 2.0, 1)
     assert world.goodput_bps(BACK_S + FIVE_S, BACK_S + FIVE_S + 2.0) > 0.85 * carries_bps(rate_bps)
@@ -64,19 +64,19 @@ def test_rates_of_all_kinds_are_found_again(rate_bps: float, thin_bps: float) ->
 
 @pytest.mark.parametrize(
     ("rate_bps", "jitter_s"),
-    [(4e6, 0.001), (8e6, 0.0), (8e6, 0.0005), (8e6, 0.001), *also((4e6, 0.0), (4e6, 0.0005))],
+    [(4e6, 0.001), (8e6, 0.0005), (8e6, 0.001), *also((4e6, 0.0), (4e6, 0.0005), (8e6, 0.0))],
 )
 def test_little_jitter_is_no_reason_for_a_queue(rate_bps: float, jitter_s: float) -> None:
-    poses = run(link(rate_bps, jitter_s), 20.0, 1).poses_ms(5.0)
+    poses = run(link(rate_bps, jitter_s), 14.0, 1).poses_ms(5.0)
     assert at(poses, 0.5) < 1e3 * DELAY_S + 5.0
     assert at(poses, 0.99) < 1e3 * DELAY_S + 10.0
 
 
 @pytest.mark.parametrize("jitter_s", [0.005, 0.010])
 def test_a_queue_is_no_longer_than_jitter_makes_it(jitter_s: float) -> None:
-    world = run(link(8e6, jitter_s), 30.0, 1)
+    world = run(link(8e6, jitter_s), 18.0, 1)
     assert at(world.poses_ms(5.0), 0.99) < 1e3 * (DELAY_S + 3 * jitter_s) + 5.0
-    assert world.goodput_bps(5.0, 30.0) > 0.93 * carries_bps(8e6)
+    assert world.goodput_bps(5.0, 18.0) > 0.93 * carries_bps(8e6)
 
 
 @pytest.mark.parametrize(
@@ -85,10 +85,10 @@ def test_a_queue_is_no_longer_than_jitter_makes_it(jitter_s: float) -> None:
 def test_a_path_that_drops_what_it_cannot_keep_is_full(queue_packets: int, loss: float, lost_at_most: float) -> None:
     """Its queue is shorter than jitter, so it does not answer: what is lost does."""
     model = replace(link(8e6, 0.005), queue_packets=queue_packets, loss=loss)
-    world = run(model, 20.0, 1)
+    world = run(model, 14.0, 1)
     flow = world.flows[0]
     assert flow.lost_packets <= lost_at_most * flow.sent_packets
-    assert world.goodput_bps(5.0, 20.0) > 0.85 * carries_bps(8e6) * (1.0 - loss)
+    assert world.goodput_bps(5.0, 14.0) > 0.85 * carries_bps(8e6) * (1.0 - loss)
 
 
 @pytest.mark.parametrize("seed", [2, 4])
@@ -97,10 +97,10 @@ def test_two_that_share_a_link_with_jitter_do_not_take_each_other_for_rivals(see
     world = World(link(8e6, 0.005), seed=seed)
     for start_s in (0.0, 5.0):
         world.flow(HybridWindow(), start_s=start_s)
-    world.run(30.0)
+    world.run(22.0)
     for index in range(2):
-        assert at(world.poses_ms(15.0, index=index), 0.99) < 1e3 * DELAY_S + 50.0
-    assert world.goodput_bps(15.0, 30.0, 0) + world.goodput_bps(15.0, 30.0, 1) > 0.93 * carries_bps(8e6)
+        assert at(world.poses_ms(12.0, index=index), 0.99) < 1e3 * DELAY_S + 50.0
+    assert world.goodput_bps(12.0, 22.0, 0) + world.goodput_bps(12.0, 22.0, 1) > 0.93 * carries_bps(8e6)
 
 
 RATE = 1e6
