@@ -115,7 +115,7 @@ async def test_kinds_of_object(tmp_path: Path) -> None:
     [
         (
             {"kind": "thing"},
-            "kind is 'thing'; accepted: topic, transform, node, robot, obstacle, terrain, patch, command",
+            "kind is 'thing'; accepted: topic, transform, node, robot, obstacle, terrain, patch, discrepancy, command",
         ),
         ({"kin": "node"}, "unknown parameter 'kin'; accepted: kind, owner, topic, definitions, values, since, epoch"),
         ({"since": "x"}, "since is 'x'; a version or epoch of an earlier answer is needed"),
