@@ -49,6 +49,8 @@ RELAY, ROBOT, TWIN = "relay", "robot", "twin"
 PROFILE: Final = "demo-twin"
 SETTLES_S: Final = 3.0
 """After the first pose, before the script begins: the twin learns how late the robot is."""
+ERROR_M: Final = 0.04
+"""What the twin is told of the robot's localisation: four times its sigma of 1 cm in each axis."""
 LOOK_S: Final = 0.1
 SAID_S: Final = 1.0
 POSE: Final = f"/{ROBOT}/odometry/filtered"
@@ -86,7 +88,7 @@ def contents(options: Options, relay_port: int, web: dict[str, int]) -> dict[str
     }
     twin: dict[str, Any] = {
         "kind": "twin",
-        "robots": [{"name": ROBOT, "pose": POSE, "plan": PLAN, "max_speed_mps": 1.5}],
+        "robots": [{"name": ROBOT, "pose": POSE, "plan": PLAN, "max_speed_mps": 1.5, "error_m": ERROR_M}],
     }
     if options.view_port is not None:
         twin["view"] = {"listen": f"{HOST}:{options.view_port}"}
