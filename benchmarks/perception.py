@@ -89,7 +89,7 @@ def _ious(said: list[NDArray[np.uint8]], labels: NDArray[np.uint8]) -> dict[int,
 def _recall(
     masks: list[NDArray[np.bool_]], labels: NDArray[np.uint8], channels: NDArray[np.float32]
 ) -> dict[PointClass, float]:
-    """Of the things of each kind the share that is found, in per cent."""
+    """The share of the things of each kind that is found, in per cent."""
     found = dict.fromkeys(KINDS, 0)
     all_of = dict.fromkeys(KINDS, 0)
     for mask, label, channel in zip(masks, labels, channels, strict=True):

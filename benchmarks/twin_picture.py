@@ -33,7 +33,7 @@ WIDTH: Final = 1200
 HEIGHT: Final = 750
 COLOURS: Final = 256
 CLOSE_NOTE: Final = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(each => each.click())"
-"""The colour of viser's note that the drawing is done in software."""
+"""It closes viser's note that the drawing is done in software."""
 STEP_S: Final = 0.05
 LINK: Final = "connected to relay; 1 of 2 peers away: jackal1 is gone for 8 s; 84 ms there and back"
 SILENT_S: Final = 8.0

@@ -73,7 +73,7 @@ class Task:
         return np.concatenate(([0.0], np.cumsum(steps)))
 
     def furthest(self, batch: Batch) -> int:
-        """Of the points of the path that are nearest to the trajectories' ends, the furthest along."""
+        """The point of the path that is the furthest along of those nearest to the trajectories' ends."""
         x, y, _yaw = batch.last()
         path = self.path_m.astype(np.float32)
         squares = (path[:, 0, None] - x) ** 2 + (path[:, 1, None] - y) ** 2
@@ -110,7 +110,7 @@ def _weighted(costs: Singles, weight: float, power: int) -> Singles:
 
 @dataclass(frozen=True, slots=True)
 class ConstraintCritic:
-    """Against speeds that the robot does not have."""
+    """Costs of speeds that the robot does not have."""
 
     cost_weight: float = 4.0
     cost_power: int = 1
@@ -122,7 +122,7 @@ class ConstraintCritic:
 
 @dataclass(frozen=True, slots=True)
 class CostCritic:
-    """Against obstacles, real ones, and against what the twin says, as far as its soft costs go.
+    """Costs of what is near: real obstacles, and what the twin says as far as its soft costs go.
 
     What the twin says adds to the cost of a point and never makes it a collision.
     """
@@ -148,7 +148,7 @@ class CostCritic:
 
 @dataclass(frozen=True, slots=True)
 class GoalCritic:
-    """To the goal, when it is near."""
+    """Costs of being away from the goal, when it is near."""
 
     cost_weight: float = 5.0
     cost_power: int = 1
@@ -163,7 +163,7 @@ class GoalCritic:
 
 @dataclass(frozen=True, slots=True)
 class GoalAngleCritic:
-    """To the goal's yaw, when it is very near."""
+    """Costs of looking another way than the goal's, when it is very near."""
 
     cost_weight: float = 3.0
     cost_power: int = 1
@@ -209,7 +209,7 @@ class PathAlignCritic:
 
 @dataclass(frozen=True, slots=True)
 class PathFollowCritic:
-    """On along the path: towards a free point of it that is a little further than any trajectory comes."""
+    """Costs of staying behind: the robot is to go on towards a free point of it that is a little further than any trajectory comes."""
 
     cost_weight: float = 5.0
     cost_power: int = 1
@@ -253,7 +253,7 @@ class PathAngleCritic:
 
 @dataclass(frozen=True, slots=True)
 class PreferForwardCritic:
-    """Against driving backwards, where the goal is not near."""
+    """Costs of driving backwards, where the goal is not near."""
 
     cost_weight: float = 5.0
     cost_power: int = 1

@@ -154,7 +154,7 @@ def _nearest(costmap: Costmap, free: Mask, place_m: Point, radius_m: float) -> i
 
 
 class _Search:
-    """From one cell, by A* to the goal; to all cells if that is not reached."""
+    """A search from one cell, by A* to the goal; to all cells if that is not reached."""
 
     def __init__(self, costmap: Costmap, free: Mask, begin: int, goal: int, options: PlannerOptions) -> None:
         grid = costmap.grid

@@ -195,7 +195,7 @@ class _Field:
         return float(counted.mean()), float(values[counted].mean())
 
     def _index(self, places_m: Floats, axis: int) -> Floats:
-        """In cells from the padded corner."""
+        """Places in cells from the padded corner."""
         found: Floats = (places_m - self._corner[axis]) / self._cell_m + self._pad
         return found
 

@@ -18,7 +18,7 @@ _STILL: Final = (0.0, 0.0)
 
 
 class Behaviour(StrEnum):
-    """In the order of Nav2's round robin."""
+    """What is tried, in the order of Nav2's round robin."""
 
     CLEAR_COSTMAP = "clear_costmap"
     SPIN = "spin"
@@ -108,7 +108,7 @@ class Recovery:
                 return self._back_up(now_s, pose, costmap)
 
     def _spin(self, now_s: float, pose: Pose) -> tuple[Progress, Speed]:
-        """In place, so a round robot meets nothing."""
+        """Turn in place: a round robot meets nothing."""
         options = self.options
         self._turned_rad += math.remainder(pose[2] - self._yaw_rad, 2 * math.pi)
         self._yaw_rad = pose[2]

@@ -319,7 +319,7 @@ class _Reading:
         )
 
     def _walk(self, r: NDArray[np.float32], z: NDArray[np.float32], key: Indices) -> "_Ground":
-        """From the robot outwards by the lowest point of each bin: ground, or too steep for it, or an edge before."""
+        """Walk outwards from the robot by the lowest point of each bin: ground, or too steep for it, or an edge before."""
         options, cells = self._options, self._shape[0] * self._shape[1]
         low_z = np.full(cells, np.inf, np.float32)
         np.minimum.at(low_z, key, z)
@@ -429,7 +429,7 @@ class _Reading:
         return edges_m
 
     def _extent(self, ground: "_Ground", edges_m: Floats) -> Floats:
-        """From where to where there is ground, (sectors, 2): from the first that was seen on, up to an edge."""
+        """Where ground begins and ends, (sectors, 2): from the first that was seen on, up to an edge."""
         starts, ends = self._bins_m[:-1, None], self._bins_m[1:, None]
         seen = ground.seen & (starts < edges_m)
         first = np.where(seen, starts, np.inf).min(axis=0)
@@ -448,7 +448,7 @@ class _Reading:
         return places[there].astype(np.float64), tops[there].astype(np.float64)
 
     def _lowest(self, ground: "_Ground") -> NDArray[np.float32]:
-        """Of the rays that go on beyond a bin the lowest passes here; a ray that ends on the ground shows all of it."""
+        """How low the lowest ray passes of those that go on beyond each bin; a ray that ends on the ground shows all of it."""
         flattest = np.full(self._shape[0] * self._shape[1], np.inf, np.float32)
         inclination = (self._z - np.float32(self._height_m)) / self._r
         at = np.where(self._near, self._bin, self._shape[0] - 1) * self._shape[1] + self._sector

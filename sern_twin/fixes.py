@@ -27,7 +27,7 @@ SURE: Final = 4.0
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """Of sensor_msgs/NavSatFix. `valid`: the receiver has a fix."""
+    """What sensor_msgs/NavSatFix says. `valid`: the receiver has a fix."""
 
     latitude_deg: float
     longitude_deg: float
@@ -65,7 +65,7 @@ class Fixes:
         self._yaw_rad = motion.yaw_rad
 
     def _velocity_mps(self, stamp_s: float) -> tuple[float, float]:
-        """Of the fixes before this one: it may be a jump itself."""
+        """The velocity of the fixes before this one, which may be a jump itself."""
         while self._taken and self._taken[0][0] < stamp_s - WINDOW_S:
             self._taken.popleft()
         if len(self._taken) < FEWEST or self._taken[-1][0] - self._taken[0][0] < SHORTEST_S:

@@ -66,7 +66,7 @@ def cycle(report: Report, cycles: int) -> None:
 
 
 def plans(report: Report, count: int) -> None:
-    """From corner to corner of 400² cells in which a tenth is occupied, and a twin says as much."""
+    """Plans from corner to corner of 400² cells in which a tenth is occupied, and a twin says as much."""
     grid = Grid(0.0, 0.0, 0.1, 400, 400)
     draw = np.random.default_rng(3)
     layers = LayeredCostmap(grid)

@@ -44,7 +44,7 @@ class LinkProfile:
     every_s: float = 60.0
 
     def stamp_s(self, now_s: float) -> float:
-        """When the newest of the twin is from that has arrived by now."""
+        """The moment that the newest of the twin is of which has arrived by now."""
         into_s = now_s % self.every_s
         said_s = now_s if into_s >= self.gone_s else now_s - into_s
         return said_s - self.late_s
@@ -61,7 +61,7 @@ PROFILES: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """`reached`: the goal, without help. `cycle_ms`: what each command took, on a clock."""
+    """`reached`: the goal, without help. `ended`: state and code of the navigator."""
 
     seed: int
     mode: Mode

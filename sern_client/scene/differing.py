@@ -106,7 +106,7 @@ class SceneDiscrepancies:
             self._unused(Unused.UNREADABLE)
             self._said(f"{item.owner} tells of a discrepancy that cannot be read: {item.id}")
             return
-        if item.id not in self._all and len(self._all) >= MOST_OF_OTHERS:
+        if item.id not in self._all and len(self._all) - len(self._told) >= MOST_OF_OTHERS:
             self._unused(Unused.FULL)
             return
         self._all[item.id] = seen

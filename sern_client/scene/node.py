@@ -98,6 +98,8 @@ class SceneNode:
         self._prefix = f"/scene/{options.name}/"
         self._scanners = [Scanner(each, grid, self.unused) for each in options.scanners]
         self._rates = UpdateRates(grid, options.rates)
+        self._twin: tuple[Cells, NDArray[np.bool_]] | None = None
+        """What the twin has without what is seen, and where somebody added something; None: it has changed since."""
         self._pose_error_m = max((each.pose_error_m for each in options.scanners), default=0.0)
         self.obstacles = Obstacles(grid, self.unused)
         self._writer = bodies.Writer(grid, encoding)
@@ -239,8 +241,9 @@ class SceneNode:
             self.obstacles.changed = False
             self._paint()
         now = self._now()
-        added = self.scene.merged("twin_only") >= OCCUPIED
-        self._rates.look([scanner.place_m for scanner in self._scanners if scanner.place_m], added, now=now)
+        if self._scanners:
+            places_m = [scanner.place_m for scanner in self._scanners if scanner.place_m]
+            self._rates.look(places_m, self._twin_now()[1], now=now)
         for key in self.scene.publish({"live": self._rates.due(now)}):
             self._change(key)
             if key.layer == "live":
@@ -269,8 +272,15 @@ class SceneNode:
         return self._together(LAYERS)
 
     def twin_cells(self) -> Cells:
-        """What the twin has without what is seen: what is added over what the map says."""
-        return self._together(tuple(layer for layer in LAYERS if layer != "live"))
+        """What the twin has without what is seen: what is added over what the map says. To be read alone."""
+        return self._twin_now()[0]
+
+    def _twin_now(self) -> tuple[Cells, NDArray[np.bool_]]:
+        """All cells are looked at when they have changed, and not ten times a second."""
+        if self._twin is None:
+            told = self._together(tuple(layer for layer in LAYERS if layer != "live"))
+            self._twin = told, self.scene.merged("twin_only") >= OCCUPIED
+        return self._twin
 
     def discrepancies(self) -> tuple[SeenDiscrepancy, ...]:
         """Where scanners of any site see something else than the twin has."""
@@ -290,6 +300,8 @@ class SceneNode:
 
     def _change(self, key: BlockKey) -> None:
         self._changed.add(key.block)
+        if key.layer != "live":
+            self._twin = None
         if key.layer != "base":
             self._changed_s[key.block] = self._now()
         self.changes += 1

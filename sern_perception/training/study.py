@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t as student
 
 from sern_perception.training.learning import (
     Budget,
@@ -26,8 +27,6 @@ TRAINING_SCANS: Final = 480
 OTHER_SCANS: Final = 160
 TEST_SCANS: Final = 120
 CALIBRATION_SCANS: Final = 80
-T_95: Final = {2: 12.71, 3: 4.30, 4: 3.18, 5: 2.78, 6: 2.57, 7: 2.45, 8: 2.36, 9: 2.31, 10: 2.26}
-"""Student's t for a two-sided interval of 95 %, by the number of seeds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,10 +43,10 @@ class Tried:
 
 
 def interval(values: list[float]) -> tuple[float, float]:
-    """Mean and half of the width of its 95 % interval; NaN for one value."""
+    """Mean and half of the width of its 95 % interval (Student's t); NaN for one value."""
     if len(values) < 2:
         return fmean(values), math.nan
-    return fmean(values), T_95[len(values)] * stdev(values) / math.sqrt(len(values))
+    return fmean(values), float(student.ppf(0.975, len(values) - 1)) * stdev(values) / math.sqrt(len(values))
 
 
 def tried(seed: int, budget: Budget, told: Told) -> Iterator[Tried]:

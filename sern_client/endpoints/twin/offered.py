@@ -17,7 +17,7 @@ class _Topic:
     info: TopicInfo
     subscriptions: "list[HeldSubscription[_Topic]]" = field(default_factory=list)
     last: tuple[bytes, int] | None = None
-    """Of a latched topic, for who comes late."""
+    """The last message of a latched topic, for who comes late."""
 
 
 class Offered:

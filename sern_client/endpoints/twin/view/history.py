@@ -133,7 +133,7 @@ class SceneHistory:
             self._bytes -= self._moments.popleft().size_bytes
 
     def at(self, time_s: float) -> SceneMoment | None:
-        """As it was then; as it was first, where that is before. None: there is nothing."""
+        """The scene as it was then, or at first where that is before. None: there is nothing."""
         if not self._moments:
             return None
         return self._moments[max(0, bisect_right(self._moments, time_s, key=_time_s) - 1)]

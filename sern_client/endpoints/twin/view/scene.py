@@ -75,6 +75,8 @@ class Drawing:
         self._origin: NDArray[np.float64] | None = None
         self._robots: list[_RobotMarks] = []
         self._terrain: Terrain | None = None
+        self._level_m = 0.0
+        """The height of the ground where it is not known: the median."""
         self._discrepancies: tuple[SeenDiscrepancy, ...] = ()
         scene.configure_environment_map(None)
         scene.add_light_hemisphere("/light/sky", sky_color=(255, 255, 255), ground_color=(190, 190, 190), intensity=1.4)
@@ -123,9 +125,11 @@ class Drawing:
         """Show the ground, and what stands on it. Where its heights are known, all else is drawn on it."""
         corners = mesh.vertices.astype(np.float64)
         self._terrain = terrain
+        if terrain is not None:
+            self._level_m = float(np.nanmedian(terrain.heights_m))
         east_m, north_m, up_m = (float(value) for value in corners[0])
         if terrain is not None:
-            up_m = float(np.nanmedian(terrain.heights_m))
+            up_m = self._level_m
             self._scene.remove_by_name("/ground")
         origin = self._need_origin(Place(east_m, north_m, up_m, 0.0), known=terrain is not None)
         self._scene.add_mesh_simple(
@@ -177,8 +181,7 @@ class Drawing:
         if self._terrain is None:
             return np.full(len(places_m), otherwise_m)
         heights_m = self._terrain.height_m(places_m[:, 0], places_m[:, 1])
-        missing_m = float(np.nanmedian(self._terrain.heights_m))
-        return np.where(np.isnan(heights_m), missing_m, heights_m)
+        return np.where(np.isnan(heights_m), self._level_m, heights_m)
 
     def camera(self, snapshot: Snapshot) -> Camera | None:
         """Where all robots and their paths are seen well. None: there are none yet."""

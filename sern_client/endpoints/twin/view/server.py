@@ -136,7 +136,7 @@ class TwinView:
             await self._draw_blocks(page, scene, past, now)
 
     async def _draw_blocks(self, page: "Page", scene: SceneShown, past: SceneMoment | None, now: float) -> None:
-        """As they are, or as they were in the past; seldom, since there may be many."""
+        """Draw blocks as they are, or as they were in the past; seldom, since there may be many."""
         other = past is not self._past
         changed = past is None and (scene.changes != self._changes or now >= self._ages_due_s)
         if not other and not (changed and now >= self._blocks_due_s):
