@@ -209,7 +209,8 @@ class PathAlignCritic:
 
 @dataclass(frozen=True, slots=True)
 class PathFollowCritic:
-    """Costs of staying behind: the robot is to go on towards a free point of it that is a little further than any trajectory comes."""
+    """Costs of staying behind: the robot is to go on towards a free point of the path, a little further than any
+    trajectory comes."""
 
     cost_weight: float = 5.0
     cost_power: int = 1

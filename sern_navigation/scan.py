@@ -319,7 +319,7 @@ class _Reading:
         )
 
     def _walk(self, r: NDArray[np.float32], z: NDArray[np.float32], key: Indices) -> "_Ground":
-        """Walk outwards from the robot by the lowest point of each bin: ground, or too steep for it, or an edge before."""
+        """Walk outwards by the lowest point of each bin: ground, or too steep for it, or an edge before."""
         options, cells = self._options, self._shape[0] * self._shape[1]
         low_z = np.full(cells, np.inf, np.float32)
         np.minimum.at(low_z, key, z)
@@ -448,7 +448,7 @@ class _Reading:
         return places[there].astype(np.float64), tops[there].astype(np.float64)
 
     def _lowest(self, ground: "_Ground") -> NDArray[np.float32]:
-        """How low the lowest ray passes of those that go on beyond each bin; a ray that ends on the ground shows all of it."""
+        """How low the lowest ray beyond each bin passes; one that ends on the ground shows all of it."""
         flattest = np.full(self._shape[0] * self._shape[1], np.inf, np.float32)
         inclination = (self._z - np.float32(self._height_m)) / self._r
         at = np.where(self._near, self._bin, self._shape[0] - 1) * self._shape[1] + self._sector

@@ -166,7 +166,7 @@ def _sampled(features: Tensor, channels: Tensor, draw: np.random.Generator) -> T
 
 
 def _weights(labels: NDArray[np.uint8]) -> Tensor:
-    """Weights of the classes, the less the more pixels one has, by the root of the logarithm's argument (SqueezeSeg)."""
+    """Class weights, the less the more pixels one has, by the root of the logarithm's argument (SqueezeSeg)."""
     counts = np.bincount(labels[labels > 0].ravel(), minlength=len(CLASSES))
     shares = counts / max(1, int(counts.sum()))
     return torch.from_numpy(1.0 / np.log(1.1 + shares)).float()
