@@ -19,9 +19,11 @@ Resolve = Callable[[str], Path]
 Options = TypeVar("Options", bound="DataclassInstance")
 
 
-def make_section(section: sections.EndpointSection, resolve: Resolve, *, second: bool = False) -> Endpoint:
+def make_section(
+    section: sections.EndpointSection, resolve: Resolve, *, second: bool = False, as_node: bool = False
+) -> Endpoint:
     """One of them. `second`: another process has an endpoint of this section already, whose ports are taken, and which
-    reads what there is."""
+    reads what there is. `as_node`: it is a node as others have, and clients take what it publishes for their site's."""
     match section:
         case sections.BagEndpoint():
             from sern_client.endpoints.bag import BagEndpoint, BagOptions
@@ -34,14 +36,15 @@ def make_section(section: sections.EndpointSection, resolve: Resolve, *, second:
         case sections.RclpyEndpoint():
             from sern_client.endpoints.rclpy import RclpyEndpoint, RclpyOptions
 
-            return RclpyEndpoint(options_of(RclpyOptions, section, resolve))
+            return RclpyEndpoint(options_of(RclpyOptions, section, resolve, as_node=as_node))
         case sections.ZenohEndpoint():
             from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint
             from sern_client.endpoints.zenoh.options import ZenohOptions
 
-            return ZenohEndpoint(options_of(ZenohOptions, section, resolve, second=second))
+            given = {"second": second} | ({"enclave": "/"} if as_node else {})
+            return ZenohEndpoint(options_of(ZenohOptions, section, resolve, **given))
         case sections.DdsEndpoint():
-            return _dds(section, resolve)
+            return _dds(section, resolve, as_node=as_node)
         case TwinEndpoint():
             return _twin(section, resolve)
         case sections.SyntheticEndpoint():
@@ -51,7 +54,7 @@ def make_section(section: sections.EndpointSection, resolve: Resolve, *, second:
         case sections.Ros1Endpoint():
             from sern_client.endpoints.ros1 import Ros1Endpoint, Ros1Options
 
-            return Ros1Endpoint(options_of(Ros1Options, section, resolve, publishes_only=second))
+            return Ros1Endpoint(options_of(Ros1Options, section, resolve, publishes_only=second, as_node=as_node))
     raise UsageError(f"no endpoint for a section of type {type(section).__name__}")
 
 
@@ -102,7 +105,7 @@ def _twin(section: TwinEndpoint, resolve: Resolve) -> Endpoint:
     return TwinEndpoint(options)
 
 
-def _dds(section: sections.DdsEndpoint, resolve: Resolve) -> Endpoint:
+def _dds(section: sections.DdsEndpoint, resolve: Resolve, *, as_node: bool) -> Endpoint:
     try:
         from sern_client.endpoints.dds.domain import environment_domain
         from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
@@ -112,4 +115,4 @@ def _dds(section: sections.DdsEndpoint, resolve: Resolve) -> Endpoint:
         ) from None
     if section.domain is None:
         section = section.model_copy(update={"domain": environment_domain()})
-    return DdsEndpoint(options_of(DdsOptions, section, resolve))
+    return DdsEndpoint(options_of(DdsOptions, section, resolve, as_node=as_node))

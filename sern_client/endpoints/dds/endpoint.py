@@ -61,7 +61,8 @@ _log = logging.getLogger(__name__)
 @dataclass(frozen=True, slots=True)
 class DdsOptions:
     """`queue_depth`: messages of one topic that may wait for the event loop; `max_buffer_bytes`: of all together.
-    `offer_lifespan`: readers drop what is older than the stream's lifespan, by their own clocks."""
+    `offer_lifespan`: readers drop what is older than the stream's lifespan, by their own clocks. `as_node`: for SERN
+    endpoints it is a node as others have, whose topics are of this site."""
 
     domain: DomainOptions = field(default_factory=DomainOptions)
     node_name: str = "sern"
@@ -70,6 +71,7 @@ class DdsOptions:
     max_buffer_bytes: int = 64 * 2**20
     offer_lifespan: bool = False
     accept_bridged: bool = False
+    as_node: bool = False
 
 
 class DdsEndpoint:
@@ -83,7 +85,7 @@ class DdsEndpoint:
         self.types = Definitions(options.type_paths)
         self.entities = Entities(
             self.graph, self.counters, options.domain, node_name=options.node_name, queue_depth=options.queue_depth,
-            max_buffer_bytes=options.max_buffer_bytes,
+            max_buffer_bytes=options.max_buffer_bytes, as_node=options.as_node,
         )  # fmt: skip
         self.say_once = SayOnce(_log, logging.ERROR)
         self.services = DdsServices(self.entities, self.types, self.say_once)

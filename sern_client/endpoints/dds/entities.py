@@ -116,7 +116,7 @@ class Entities:
 
     def __init__(
         self, graph: Graph, counters: DdsCounters, domain: DomainOptions, *, node_name: str, queue_depth: int,
-        max_buffer_bytes: int,
+        max_buffer_bytes: int, as_node: bool = False,
     ) -> None:  # fmt: skip
         self.graph = graph
         self.counters = counters
@@ -124,6 +124,7 @@ class Entities:
         """Readers that are closed and have not ended."""
         self._domain = domain
         self._node_name = node_name
+        self._as_node = as_node
         self.queue_depth = queue_depth
         self._max_buffer_bytes = max_buffer_bytes
         self._maker = TypeMaker()
@@ -139,7 +140,8 @@ class Entities:
         domain = self._domain.domain
         open_domain(self._domain)
         try:
-            said = user_data(enclave=SERN_ENCLAVE, **{SERN_KEY: self._node_name})
+            sern = {"enclave": SERN_ENCLAVE, SERN_KEY: self._node_name}
+            said = user_data(**({"enclave": "/"} if self._as_node else sern))
             participant = DomainParticipant(domain, Qos(Policy.EntityName(self._node_name), Policy.Userdata(said)))
         except DDSException as error:
             close_domain(domain)

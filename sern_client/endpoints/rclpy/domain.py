@@ -78,7 +78,8 @@ class Domain:
         self._closing.clear()
         context = Context()
         with refused(f"endpoint rclpy: {self.name} cannot be joined"), ExitStack() as failed:
-            rclpy.init(args=["--ros-args", "--enclave", ENCLAVE], context=context, domain_id=self._options.domain)
+            args = [] if self._options.as_node else ["--ros-args", "--enclave", ENCLAVE]
+            rclpy.init(args=args, context=context, domain_id=self._options.domain)
             failed.callback(rclpy.shutdown, context=context)
             node = Node(
                 self._options.node_name, context=context, use_global_arguments=False, enable_rosout=False,

@@ -8,7 +8,7 @@ from pathlib import Path
 class RclpyOptions:
     """`domain` None: ROS_DOMAIN_ID of the environment. `poll_hz`: how often the graph is asked what there is.
     `services_only`: topics are another endpoint's, in the same client. `max_buffer_bytes`: what may wait for the event
-    loop."""
+    loop. `as_node`: for SERN endpoints it is a node as others have, whose topics are of this site."""
 
     node_name: str = "sern"
     domain: int | None = None
@@ -17,3 +17,4 @@ class RclpyOptions:
     type_paths: tuple[Path, ...] = ()
     max_buffer_bytes: int = 64 * 2**20
     accept_bridged: bool = False
+    as_node: bool = False

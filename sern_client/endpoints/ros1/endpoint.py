@@ -63,7 +63,8 @@ class Ros1Options:
     """Which master, who we are there, and the limits. None is the default of the environment, as for any ROS node:
     `master_uri` ROS_MASTER_URI, else http://localhost:11311; `host` (the name or address at which other nodes reach
     us) ROS_HOSTNAME, else ROS_IP, else what this machine has towards the master. `node_name` is sern. With
-    `publishes_only` the node takes no topic from its master: another one of the same client does.
+    `publishes_only` the node takes no topic from its master: another one of the same client does. `as_node`: for SERN
+    endpoints it is a node as others are, whose topics are of this site.
     """
 
     master_uri: str | None = None
@@ -77,6 +78,7 @@ class Ros1Options:
     tcp_nodelay: bool = True
     accept_bridged: bool = False
     publishes_only: bool = False
+    as_node: bool = False
 
 
 class Ros1Endpoint:
@@ -119,7 +121,7 @@ class Ros1Endpoint:
         self._off = False
         self._tcpros_port = 0
         self._master = Master(self.master_uri, self.caller)
-        self._host_of_services = ServiceHost(self.caller)
+        self._host_of_services = ServiceHost(self.caller, as_node=options.as_node)
         self._graph = Graph(self._master, self, self._graph_changed, poll_s=1 / options.poll_hz)
         self._ended = Ended(self._publications, self._graph.poll_now)
         self._services = ServiceWatch(
@@ -205,7 +207,9 @@ class Ros1Endpoint:
             self._ended(publication)
             publication = None
         if publication is None:
-            publication = self._publications[name] = Publication(name, info, self.caller, self._limits, self._ended)
+            publication = self._publications[name] = Publication(
+                name, info, self.caller, self._limits, self._ended, as_node=self.options.as_node
+            )
             handle = Handle(publication)  # first: a publication without one ends as soon as nobody is waited for
             self._tell_subscribers(publication)
             # A subscriber whose connection ended comes back only when the master tells it of a publisher; of a topic

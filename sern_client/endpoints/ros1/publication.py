@@ -124,9 +124,12 @@ class Limits:
 
 
 class Publication:
-    """One topic that this node publishes. `topic` is its name at the master. `over` is called when it has ended."""
+    """One topic that this node publishes. `topic` is its name at the master. `over` is called when it has ended.
+    `as_node`: other SERN endpoints are not told that it is one's."""
 
-    def __init__(self, topic: str, info: TopicInfo, caller: str, limits: Limits, over: "Ended") -> None:
+    def __init__(
+        self, topic: str, info: TopicInfo, caller: str, limits: Limits, over: "Ended", *, as_node: bool = False
+    ) -> None:
         self.topic = topic
         self.info = info
         self.type_name = ros_types.ros1_name(info.type_name)
@@ -160,8 +163,7 @@ class Publication:
             "md5sum": info.type_hash,
             "message_definition": info.definition,
             "latching": "1" if self.latched else "0",
-            BRIDGE_FIELD: caller,
-        }
+        } | ({} if as_node else {BRIDGE_FIELD: caller})
 
     def fits(self, info: TopicInfo) -> bool:
         """Whether another stream is of the same type."""

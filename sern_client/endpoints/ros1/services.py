@@ -241,8 +241,7 @@ class Served:
             "type": type_name,
             "request_type": f"{type_name}Request",
             "response_type": f"{type_name}Response",
-            BRIDGE_FIELD: owner.caller,
-        }
+        } | ({} if owner.as_node else {BRIDGE_FIELD: owner.caller})
 
     def close(self) -> None:
         self._owner.withdraw(self)
@@ -311,8 +310,10 @@ class _Call:
 class ServiceHost:
     """The services that we serve; `accept` is what the TCPROS port asks."""
 
-    def __init__(self, caller: str) -> None:
+    def __init__(self, caller: str, *, as_node: bool = False) -> None:
         self.caller = caller
+        self.as_node = as_node
+        """Other SERN endpoints are not told that a service is one's."""
         self.served: dict[str, Served] = {}
 
     def serve(self, name: str, info: ServiceInfo, handler: ServiceHandler) -> Served:

@@ -45,7 +45,7 @@ PAIRS = [
     (RclpyEndpoint, RclpyOptions),
     (TwinEndpoint, TwinOptions),
 ]
-SAID_BY_NO_FILE = {"second", "publishes_only", "enclave"}
+SAID_BY_NO_FILE = {"second", "publishes_only", "enclave", "as_node"}
 OTHERWISE_BY_DEFAULT = {(DdsOptions, "domain")}
 """Which domain it is where the file says nothing, the environment says."""
 
