@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from sern_core.vocabulary.errors import UsageError
 from sern_navigation.costmap.costs import LETHAL_OBSTACLE, MAX_NON_OBSTACLE, NO_INFORMATION, Costmap, Mask
+from sern_navigation.costmap.layered import Snapshot
 from sern_twin.world.grid import NOWHERE, Floats, Indices
 
 Point = tuple[float, float]
@@ -39,6 +40,8 @@ class PlanCode(StrEnum):
     START_OCCUPIED = "start_occupied"
     GOAL_OCCUPIED = "goal_occupied"
     NO_VALID_PATH = "no_valid_path"
+    TIMEOUT = "timeout"
+    """Nobody answered within `max_planning_time`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,9 +58,13 @@ class PlannerOptions:
     where Nav2's weight would lead into each dead end that it knows of. It never closes a way."""
     start_tolerance: float = 0.35
     """[m]: how far away a robot that touches an obstacle may begin its way. Nav2 has none: such a start is occupied."""
+    max_planning_time: float = 2.0
+    """[s]: how long a navigator that does not plan itself waits for a plan."""
 
     def __post_init__(self) -> None:
-        for name in ("tolerance", "cost_travel_multiplier", "twin_travel_multiplier", "start_tolerance"):
+        for name in (
+            "tolerance", "cost_travel_multiplier", "twin_travel_multiplier", "start_tolerance", "max_planning_time",
+        ):  # fmt: skip
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise UsageError(f"a planner with {name} {value}: give a number of 0 or more")
@@ -79,6 +86,23 @@ class Plan:
     @property
     def length_m(self) -> float:
         return float(np.hypot(*np.diff(self.path_m, axis=0).T).sum())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlanRequest:
+    """A plan that is wanted, with all that it takes: it may be made in another thread or process (`plan_for`)."""
+
+    number: int
+    stamp_s: float
+    snapshot: Snapshot
+    start_m: Point
+    goal_m: Point
+    options: PlannerOptions
+
+
+def plan_for(request: PlanRequest) -> Plan:
+    """The plan that was asked for. Nothing is raised."""
+    return plan(request.snapshot.costmap(), request.start_m, request.goal_m, request.options)
 
 
 def plan(costmap: Costmap, start_m: Point, goal_m: Point, options: PlannerOptions) -> Plan:

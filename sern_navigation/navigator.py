@@ -12,6 +12,15 @@
 It has no clock: `step` is told the time. Nothing that comes from outside makes it raise; whatever cannot be used is
 counted and said in `status`, and the command is zero where it matters. What the twin says adds costs and is never an
 obstacle; without fresh real data the robot stands.
+
+A plan takes longer than a cycle has. Nav2 has a server of its own for it, and here somebody else may make it as well:
+
+```python
+navigator = Navigator(grid, generator, plans_itself=False)
+command = navigator.step(now_s, pose, cloud)  # each cycle: follows the path that there is, or stands
+request = navigator.request()  # None: no plan is due
+navigator.planned(request, plan_for(request))  # in another thread, or when its future is done
+```
 """
 
 import math
@@ -28,7 +37,7 @@ from sern_navigation.costmap.costs import Costmap
 from sern_navigation.costmap.layered import CostmapOptions, LayeredCostmap
 from sern_navigation.costmap.static import MapOutcome
 from sern_navigation.costmap.twin import TwinView
-from sern_navigation.global_plan import Plan, PlanCode, PlannerOptions, plan
+from sern_navigation.global_plan import Plan, PlanCode, PlannerOptions, PlanRequest, plan_for
 from sern_navigation.mppi import ControlCode, Mppi, MppiOptions, pruned
 from sern_navigation.recovery import Behaviour, Progress, Recovery, RecoveryOptions
 from sern_navigation.scan import Cloud, ObstacleScan, Refused, ScanOptions, obstacle_scan, turned
@@ -62,6 +71,7 @@ class Code(StrEnum):
     START_OCCUPIED = PlanCode.START_OCCUPIED.value
     GOAL_OCCUPIED = PlanCode.GOAL_OCCUPIED.value
     NO_VALID_PATH = PlanCode.NO_VALID_PATH.value
+    TIMEOUT = PlanCode.TIMEOUT.value
     NO_VALID_CONTROL = ControlCode.NO_VALID_CONTROL.value
     FAILED_TO_MAKE_PROGRESS = "failed_to_make_progress"
     GOAL_INVALID = "goal_invalid"
@@ -76,7 +86,7 @@ class Code(StrEnum):
 
 
 class Unused(StrEnum):
-    """Why something that `step` was given counted nothing."""
+    """Why something that `step` or `planned` was given counted nothing."""
 
     SCAN = "scan"
     """A cloud that makes no scan: `scan_refusals` has why."""
@@ -89,6 +99,8 @@ class Unused(StrEnum):
     """It is not finite, or before the last: all of that step."""
     SPEED = "speed"
     """It is not finite, or that of no robot."""
+    PLAN = "plan"
+    """It was made for another goal or map, or nobody waits for it any more."""
 
 
 _HOPELESS: Final = frozenset({Code.START_OUTSIDE_MAP, Code.GOAL_OUTSIDE_MAP, Code.GOAL_OCCUPIED})
@@ -176,9 +188,20 @@ _NO_PATH: Final = np.empty((0, 2))
 
 
 class Navigator:
-    """One robot on one grid. The same seed and the same calls give the same commands."""
+    """One robot on one grid. The same seed and the same calls give the same commands.
 
-    def __init__(self, grid: Grid, generator: np.random.Generator, options: NavigatorOptions | None = None) -> None:
+    `plans_itself`: `step` makes the plans, and takes as long. Else whoever calls it asks for a `request` after each
+    step, and gives the plan to `planned`, in the thread of `step`.
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        generator: np.random.Generator,
+        options: NavigatorOptions | None = None,
+        *,
+        plans_itself: bool = True,
+    ) -> None:
         self.options: Final = options or NavigatorOptions()
         self.grid: Final = grid
         self.costmap: Final = LayeredCostmap(grid, self.options.costmap)
@@ -197,6 +220,12 @@ class Navigator:
         self._complaint = ""
         self._now_s = -math.inf
         self._speed: Speed = STOPPED
+        self._plans_itself = plans_itself
+        self._requests = 0
+        self._due_s: float | None = None
+        self._due_from: Pose | None = None
+        self._open: PlanRequest | None = None
+        self._failed: Plan | None = None
         self._planned_s = -math.inf
         self._ever_planned = False
         self._reached_xy = False
@@ -219,7 +248,7 @@ class Navigator:
     def set_map(self, grid: Grid, cells: Cells) -> MapOutcome:
         """The map: -1 unknown, 0 to 100 occupied. While the last one did not fit, no goal is pursued."""
         self._map = self.costmap.static.take(grid, cells)
-        self._planned_s = -math.inf
+        self._forget_plans()
         return self._map
 
     def go(self, goal: Goal) -> None:
@@ -228,7 +257,7 @@ class Navigator:
         self._recovery.reset()
         self._controller.reset()
         self.path_m = _NO_PATH
-        self._planned_s = -math.inf
+        self._forget_plans()
         self._ever_planned = self._reached_xy = False
         self._moved = self._controlled_s = self._blind_since_s = None
         self.status = Status(State.FOLLOWING)
@@ -260,7 +289,7 @@ class Navigator:
         Nav2's open_loop.
 
         The scan is of the robot where `pose` has it. It is given once; without one the last one ages. Time does not go
-        back. A step in which the path is planned anew takes as long as `global_plan.plan` more.
+        back. If the navigator plans itself, a step with a plan takes as long as `global_plan.plan` more.
         """
         if not (math.isfinite(now_s) and now_s >= self._now_s):
             self._unused[Unused.TIME] += 1
@@ -279,6 +308,27 @@ class Navigator:
         verdict = self.monitor.process(wanted, self._real_points(pose), self._scan_s, now_s)
         self._speed = verdict.command
         return self._command(wanted, trajectory, verdict)
+
+    def request(self) -> PlanRequest | None:
+        """The plan that is due, once: nothing more is due before it is `planned`, given up, or there is another goal.
+        None: there is none."""
+        if self._due_from is None:
+            return None
+        request = self._open = self._asked(self._due_from)
+        self._due_from = None
+        return request
+
+    def planned(self, request: PlanRequest, plan: Plan) -> bool:
+        """Whether a plan is taken: the next step goes by it. One that nobody waits for is counted in `unused`."""
+        if self._open is None or request.number != self._open.number:
+            self._unused[Unused.PLAN] += 1
+            return False
+        self._open = self._due_s = None
+        if plan.found:
+            self.path_m, self._ever_planned = plan.path_m, True
+        else:
+            self._failed = plan
+        return True
 
     # What it sees
 
@@ -354,11 +404,13 @@ class Navigator:
         if local is None:
             self._end(State.ABORTED, Code.START_OUTSIDE_MAP, f"the robot at {_said(pose)} is not on the map")
             return STOPPED, _NOWHERE
-        period_s = 1 / self.options.planner_frequency if self.options.planner_frequency else math.inf
-        if not len(self.path_m) or now_s - self._planned_s >= period_s or self._path_blocked(now_s, pose, local):
-            made = self._plan(now_s, pose)
-            if not made.found:
-                return self._stuck(now_s, pose, Code(made.code.value), made.message)
+        failed = self._without_plan(now_s, pose, local)
+        if failed is not None:
+            return self._stuck(now_s, pose, Code(failed.code.value), failed.message)
+        if not len(self.path_m):
+            self._moved = None
+            self._say(State.FOLLOWING, Code.NONE, "a plan is being made")
+            return STOPPED, _NOWHERE
         target = self._target()
         away_m = math.dist(pose[:2], target[:2])
         self._say(State.FOLLOWING, Code.NONE, "", away_m)
@@ -386,13 +438,44 @@ class Navigator:
         self._say(State.FOLLOWING, Code.NO_VALID_CONTROL, control.message, away_m)
         return STOPPED, _NOWHERE
 
-    def _plan(self, now_s: float, pose: Pose) -> Plan:
+    def _without_plan(self, now_s: float, pose: Pose, local: Costmap) -> Plan | None:
+        """Want a plan if one is due, or make it; the plan that was not found, if it was not."""
+        failed, self._failed = self._failed, None
+        if failed is not None:
+            return failed
+        if self._due_s is None:
+            period_s = 1 / self.options.planner_frequency if self.options.planner_frequency else math.inf
+            if len(self.path_m) and now_s - self._planned_s < period_s and not self._path_blocked(now_s, pose, local):
+                return None
+            self._planned_s = self._due_s = now_s
+        if self._plans_itself:
+            request = self._open = self._asked(pose)
+            self.planned(request, plan_for(request))
+            failed, self._failed = self._failed, None
+            return failed
+        if self._open is None:
+            self._due_from = pose
+        most_s = self.options.planner.max_planning_time
+        if now_s - self._due_s > most_s:
+            return Plan(PlanCode.TIMEOUT, f"nobody made a plan within {most_s:g} s: see to who makes them", _NO_PATH)
+        return None
+
+    def _asked(self, pose: Pose) -> PlanRequest:
         goal = self._pursued()
-        made = plan(self.costmap.everywhere(now_s), pose[:2], (goal.x_m, goal.y_m), self.options.planner)
-        self._planned_s = now_s
-        if made.found:
-            self.path_m, self._ever_planned = made.path_m, True
-        return made
+        self._requests += 1
+        return PlanRequest(
+            self._requests,
+            self._now_s,
+            self.costmap.snapshot(self._now_s),
+            (pose[0], pose[1]),
+            (goal.x_m, goal.y_m),
+            self.options.planner,
+        )
+
+    def _forget_plans(self) -> None:
+        """What is being planned is for another goal, map or place."""
+        self._planned_s = -math.inf
+        self._due_s = self._due_from = self._open = self._failed = None
 
     def _path_blocked(self, now_s: float, pose: Pose, local: Costmap) -> bool:
         """Whether something real has come to lie on the path ahead. What the robot touches already is no news."""
@@ -440,6 +523,7 @@ class Navigator:
         if self._recovery.begin(now_s, pose) is Behaviour.CLEAR_COSTMAP:
             self.costmap.obstacles.clear()
         self.path_m = _NO_PATH
+        self._forget_plans()
         self._say(State.RECOVERING, code, message)
         return STOPPED, _NOWHERE
 
@@ -461,6 +545,7 @@ class Navigator:
         self._say(state, code, message)
         self._goal = None
         self.path_m = _NO_PATH
+        self._forget_plans()
         self._controller.reset()
 
     def _command(self, wanted: Speed, trajectory: Floats, verdict: Verdict) -> Command:

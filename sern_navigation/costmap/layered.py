@@ -5,11 +5,11 @@ from typing import Final
 
 import numpy as np
 
-from sern_navigation.costmap.costs import NO_INFORMATION, Costmap, Costs, Window, around, whole
+from sern_navigation.costmap.costs import NO_INFORMATION, Costmap, Costs, Mask, Window, around, whole
 from sern_navigation.costmap.inflation import InflationOptions, inflate
 from sern_navigation.costmap.obstacles import ObstacleLayer, ObstacleOptions
 from sern_navigation.costmap.static import StaticLayer, StaticOptions
-from sern_navigation.costmap.twin import TwinLayer, TwinOptions
+from sern_navigation.costmap.twin import TwinLayer, TwinOptions, softened
 from sern_twin.world.grid import Grid
 
 
@@ -19,6 +19,28 @@ class CostmapOptions:
     obstacles: ObstacleOptions = field(default_factory=ObstacleOptions)
     inflation: InflationOptions = field(default_factory=InflationOptions)
     twin: TwinOptions = field(default_factory=TwinOptions)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Snapshot:
+    """What all layers said at a moment, before inflation: nothing that is observed later changes it.
+
+    `real` and `twin` (rows, columns): the costs of map and real obstacles, and where the twin says that something
+    stands; None: it is stale. It is quickly made, and may go to another thread or process, which makes the costmap.
+    """
+
+    grid: Grid
+    real: Costs
+    twin: Mask | None
+    table: Costs
+    twin_table: Costs
+    inflate_unknown: bool
+
+    def costmap(self) -> Costmap:
+        """The costmap of that moment."""
+        costs = inflate(self.real, self.table, inflate_unknown=self.inflate_unknown)
+        soft = np.zeros(self.grid.shape, np.uint8) if self.twin is None else softened(self.twin, self.twin_table)
+        return Costmap(self.grid, costs, soft)
 
 
 class LayeredCostmap:
@@ -38,7 +60,19 @@ class LayeredCostmap:
 
     def everywhere(self, now_s: float) -> Costmap:
         """All of it, for a global plan."""
-        return self._of(whole(self.grid), self.grid, now_s)
+        return self.snapshot(now_s).costmap()
+
+    def snapshot(self, now_s: float) -> Snapshot:
+        """All of it, to make a costmap of elsewhere or later."""
+        everything = whole(self.grid)
+        return Snapshot(
+            self.grid,
+            _with_max(self.static.costs, self.obstacles.costs(everything)),
+            self.twin.unseen(now_s, everything, self.obstacles.seen_free),
+            self._table,
+            self.twin.table,
+            self._inflation.inflate_unknown,
+        )
 
     def local(self, now_s: float, x_m: float, y_m: float, radius_m: float) -> Costmap | None:
         """A square around the robot, for the next command; None where no cell is on the grid."""

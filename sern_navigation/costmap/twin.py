@@ -57,7 +57,9 @@ class TwinLayer:
         self._occupied: Mask = np.zeros(grid.shape, np.bool_)
         self._reach = inflation.reach_cells(grid.cell_m)
         real = inflation.table(grid.cell_m).astype(np.int64)
-        self._table = (np.minimum(real, MAX_NON_OBSTACLE) * self.options.cost // MAX_NON_OBSTACLE).astype(np.uint8)
+        self.table: Final[Costs] = (np.minimum(real, MAX_NON_OBSTACLE) * self.options.cost // MAX_NON_OBSTACLE).astype(
+            np.uint8
+        )
 
     def take(self, view: TwinView) -> MapOutcome:
         """The latest of the twin. One that does not fit leaves the layer as it was, and is counted."""
@@ -72,16 +74,25 @@ class TwinLayer:
         """Whether what it says counts now."""
         return abs(now_s - self._stamp_s) <= self.options.staleness_s
 
+    def unseen(self, now_s: float, window: Window, seen_free: Mask) -> Mask | None:
+        """Where it says that something stands and no real scan saw that nothing does, in the window's shape; None: it
+        is stale. `seen_free` (rows, columns): where real scans saw nothing."""
+        return self._occupied[window.slices] & ~seen_free[window.slices] if self.fresh(now_s) else None
+
     def soft(self, now_s: float, window: Window, seen_free: Mask) -> Costs:
         """What it costs, in the window's shape. `seen_free` (rows, columns): where real scans saw nothing."""
-        none = np.zeros((window.end_row - window.first_row, window.end_column - window.first_column), np.uint8)
-        if not self.fresh(now_s):
-            return none
         larger = window.grown(self._reach, self.grid)
-        squares = squared_cells(self._occupied[larger.slices] & ~seen_free[larger.slices])
-        if squares is None:
-            return none
-        squares = squares[window.within(larger)]
-        near = squares < len(self._table)
-        none[near] = self._table[squares[near].astype(np.int64)]
-        return none
+        unseen = self.unseen(now_s, larger, seen_free)
+        if unseen is None:
+            return np.zeros((window.end_row - window.first_row, window.end_column - window.first_column), np.uint8)
+        return softened(unseen, self.table)[window.within(larger)]
+
+
+def softened(occupied: Mask, table: Costs) -> Costs:
+    """What cells (rows, columns) cost by their distance to the occupied ones. `table`: by its square, in cells."""
+    found = np.zeros(occupied.shape, np.uint8)
+    squares = squared_cells(occupied)
+    if squares is not None:
+        near = squares < len(table)
+        found[near] = table[squares[near].astype(np.int64)]
+    return found
