@@ -361,7 +361,8 @@ class Navigator:
             points = turned(points, yaw_rad - pose[2]) + np.array([to_x_m, to_y_m])
         return np.concatenate((points, self.costmap.obstacles.marks_near(pose, self.options.local_radius_m)))
 
-    def _sees(self, now_s: float) -> bool:
+    def sees(self, now_s: float) -> bool:
+        """Whether there is a real scan that is fresh."""
         return self._scan_s is not None and abs(now_s - self._scan_s) <= self.options.monitor.source_timeout
 
     # What it wants
@@ -377,7 +378,7 @@ class Navigator:
                 f"{self.grid.columns} x {self.grid.rows}, in frame {self.grid.frame_id!r}",
             )
             return STOPPED, _NOWHERE
-        if pose is None or not self._sees(now_s):
+        if pose is None or not self.sees(now_s):
             return self._blind(now_s, pose)
         self._blind_since_s = None
         if self.status.state is State.RECOVERING:
