@@ -30,6 +30,11 @@ _MADE: Final = {
     "GetResult": _UUID + "---\nint8 status\n{action}_Result result\n",
 }
 _KNOWN_ACTIONS: Final = {
+    "nav2_msgs/action/NavigateToPose": (
+        "geometry_msgs/PoseStamped pose\nstring behavior_tree\n---\nuint16 error_code\nstring error_msg\n---\n"
+        "geometry_msgs/PoseStamped current_pose\nbuiltin_interfaces/Duration navigation_time\n"
+        "builtin_interfaces/Duration estimated_time_remaining\nint16 number_of_recoveries\nfloat32 distance_remaining\n"
+    ),
     "example_interfaces/action/Fibonacci": "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n",
 }
 

@@ -235,6 +235,9 @@ class _OwnStore(Typestore):
     def __init__(self, name: str, made: Typesdict, shared: Typestore) -> None:
         super().__init__()
         known = {**shared.fielddefs, **made}
+        other = {key for key in made if key not in shared.fielddefs or shared.fielddefs[key][1] != made[key][1]}
+        # What is the same all through is taken from there: definitions often come with all that they use.
+        made = {key: value for key, value in made.items() if not other.isdisjoint(used_by(key, known))}
         used = used_by(name, known)
         self.fielddefs = {used_name: known[used_name] for used_name in used}
         made = {used_name: known[used_name] for used_name in used if used_name in made}

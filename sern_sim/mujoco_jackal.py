@@ -148,6 +148,16 @@ class MujocoJackal:
         self.state = self._read(before)
         return self.state
 
+    @property
+    def touches(self) -> bool:
+        """Whether its body or a wheel touches what stands on the ground; to drive on a bridge is no touching."""
+        groups, labels = self._model.geom_group, self._labels
+        return any(
+            {int(groups[one]), int(groups[other])} == {_BLOCKS, _ROBOT}
+            and Label.BRIDGE not in (int(labels[one]), int(labels[other]))
+            for one, other in self._data.contact.geom[: self._data.ncon]
+        )
+
     # Sensors: each reads the present state; their noise is seeded too, in the order of the calls
 
     def imu(self) -> Inertial:

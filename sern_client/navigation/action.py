@@ -29,11 +29,10 @@ from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding, TopicName
 from sern_navigation.navigator import Code, Goal, State
 from sern_runtime import clock, ros_services, ros_types
-from sern_runtime.ros_files import TypeFiles, installed_files
+from sern_runtime.ros_files import installed_files
 from sern_runtime.ros_types import ResolvedType
 
 ACTION: Final = "nav2_msgs/action/NavigateToPose"
-OWN_DEFINITIONS: Final = Path(__file__).parent / "interfaces"
 KEEP_S: Final = 60.0
 """How long the result of a goal that ended can be asked for."""
 UNKNOWN: Final = 9000
@@ -79,12 +78,8 @@ class Types:
     @classmethod
     def known(cls, type_paths: tuple[Path, ...] = ()) -> "Types":
         """ConfigError: a definition that a directory has cannot be read."""
-        for files in (*installed_files(type_paths), TypeFiles((OWN_DEFINITIONS,))):
-            message = files.message(f"{ACTION}_FeedbackMessage")
-            if message is not None:
-                break
-        else:
-            raise ConfigError(f"the definition of {ACTION} is not in {OWN_DEFINITIONS}: install SERN anew")
+        files = installed_files(type_paths)[0]
+        message = files.message(f"{ACTION}_FeedbackMessage") or ""
 
         def service(type_name: str) -> ros_services.ResolvedService:
             return ros_services.resolve(type_name, files.service(type_name) or "", Encoding.CDR)
@@ -176,7 +171,7 @@ class NavigateToPose:
             return bodies.goal_response(accepted=False, stamp=NO_STAMP)
         self.end(State.ABORTED, Code.CANCELLED, "another goal took its place")
         self._pursued = goal
-        wanted = goal_of(message.goal)
+        wanted = goal_of(message.goal.pose)
         _log.info("%s: goal (%.2f, %.2f) in %s", self._name, wanted.x_m, wanted.y_m, wanted.frame_id)
         self._tell()
         self._go(wanted)

@@ -11,7 +11,7 @@ from sern_client.action_conversion.endpoint import ActionEndpoint, Rule
 from sern_client.endpoints.base import Endpoint, ServiceEndpoint
 from sern_client.endpoints.composite import CompositeEndpoint, with_services
 from sern_client.factory import services_elsewhere
-from sern_client.navigation.action import OWN_DEFINITIONS, NavigateToPose, Types
+from sern_client.navigation.action import NavigateToPose, Types
 from sern_client.navigation.metrics import register_navigation
 from sern_client.navigation.node import NavigationNode
 from sern_client.navigation.options import Localisation, Mount, NodeOptions, OnLinkLoss, Stamps, TopicNames
@@ -28,7 +28,7 @@ from sern_runtime.internal_errors import InternalErrors
 from sern_runtime.loop import Shutdown
 from sern_runtime.metrics import Metrics
 from sern_runtime.optional import OptionalParts
-from sern_runtime.ros_files import TypeFiles, installed_files
+from sern_runtime.ros_files import installed_files
 from sern_runtime.sdnotify import Notifier, Watchdog
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ class NavigationDaemon:
         if self.encoding is Encoding.CDR or services is None:
             return endpoint
         rule = Rule(compile_pattern(model.topics.action), GOALS_S)
-        files = [*installed_files(map(self.loaded.resolve, model.type_paths)), TypeFiles((OWN_DEFINITIONS,))]
+        files = installed_files(map(self.loaded.resolve, model.type_paths))
         return ActionEndpoint(endpoint, services, self.encoding, [rule], namespace="/", files=files)
 
     async def start(self) -> None:
@@ -111,8 +111,9 @@ class NavigationDaemon:
             if services is not None:
                 self._serve(services)
         self.tasks.append(asyncio.create_task(self.node.run(), name="navigation"))
-        kept = self.parts.keep("mapping", self.node.keep_map, reset=lambda: None)
-        self.tasks.append(asyncio.create_task(kept, name="mapping"))
+        if self.node.makes_map:
+            kept = self.parts.keep("mapping", self.node.keep_map, reset=lambda: None)
+            self.tasks.append(asyncio.create_task(kept, name="mapping"))
         self.tasks.append(asyncio.create_task(self._tick(), name="tick"))
         kinds = " and ".join(section.kind for section in model.endpoints)
         self.notifier.ready(f"navigation at {kinds}")

@@ -27,7 +27,7 @@ from sern_client.navigation.options import Localisation, NodeOptions, OnLinkLoss
 from sern_client.navigation.own_map import OwnMap
 from sern_client.navigation.planning import PlannerProcess
 from sern_client.navigation.twin_map import TwinMap
-from sern_core.vocabulary.errors import BodyError, ConfigError
+from sern_core.vocabulary.errors import BodyError, ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.names import plain_type
 from sern_core.vocabulary.types import Encoding, TopicName
@@ -269,10 +269,15 @@ class NavigationNode:
             due_s = max(due_s + period_s, self._now() - period_s)  # what was missed is not made up for
             await asyncio.sleep(max(0.0, due_s - self._now()))
 
+    @property
+    def makes_map(self) -> bool:
+        """Whether `keep_map` has anything to do."""
+        return self._own_map is not None
+
     async def keep_map(self) -> None:
         """Lay scans on the robot's own map, in a thread; what it says of the robot's place holds at once."""
         if self._own_map is None:
-            return
+            raise UsageError("the node makes no map of its own: localisation is by odometry")
         while True:
             await asyncio.sleep(MAP_S)
             if self._scan is not None:

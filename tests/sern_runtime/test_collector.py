@@ -58,12 +58,12 @@ def test_metrics_have_every_generation_from_the_start(watch: CollectorWatch) -> 
 
 def test_what_is_there_stays_and_what_comes_is_collected(watch: CollectorWatch) -> None:
     before = gc.get_threshold()
-    frozen = gc.get_freeze_count()
+    gc.unfreeze()  # what this test run has frozen itself
     watch.watch()
     watch.settle()
     assert watch.passes == [0, 0, 0], "the pass at the start is counted"
     assert gc.get_threshold() == THRESHOLDS
-    assert gc.get_freeze_count() > frozen + 10_000
+    assert gc.get_freeze_count() > 10_000
     node = Node()
     node.other = node
     gone = weakref.ref(node)
