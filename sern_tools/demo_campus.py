@@ -118,7 +118,7 @@ def campus(seed: int, dem: Path | None = None, streets: Path | None = None) -> C
     ]  # fmt: skip
     blocks.append(
         Block(
-            Label.BRIDGE, BRIDGE_X_M, DITCH_Y_M, ground.height_m(BRIDGE_X_M, DITCH_Y_M - 2.0) + 0.01,
+            Label.BRIDGE, BRIDGE_X_M, DITCH_Y_M, ground.height_m(BRIDGE_X_M, DITCH_Y_M - 2.0) - 0.02,
             (BRIDGE_HALF_M, DITCH_HALF_M + 0.6, 0.03),
         )
     )  # fmt: skip
@@ -176,7 +176,12 @@ def _with_ditch(heights: Floats) -> Floats:
     row = int(np.argmin(np.abs(y[:, 0] - DITCH_Y_M)))
     away = np.clip((np.abs(y - DITCH_Y_M) - 2.0) / 3.0, 0.0, 1.0)
     level = away * away * (3 - 2 * away)
-    level_bank = heights[row][None, :] + level * (heights - heights[row][None, :])
+    at_bridge = int(np.argmin(np.abs(x[0] - BRIDGE_X_M)))
+    from_bridge = np.clip((np.abs(x[0] - BRIDGE_X_M) - 1.5) / 3.0, 0.0, 1.0)
+    bank = heights[row] + (1 - from_bridge * from_bridge * (3 - 2 * from_bridge)) * (
+        heights[row, at_bridge] - heights[row]
+    )
+    level_bank = bank[None, :] + level * (heights - bank[None, :])
     across = np.clip((DITCH_HALF_M - np.abs(y - DITCH_Y_M)) / 0.5, 0.0, 1.0)
     beside = np.clip((np.abs(x - STREET_X_M) - STREET_HALF_M) / 0.5, 0.0, 1.0)
     found: Floats = level_bank - DITCH_DEPTH_M * across * beside
