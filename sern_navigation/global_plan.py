@@ -27,8 +27,9 @@ _STEPS: Final = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1
 _SQRT2: Final = math.sqrt(2)
 _LEAST: Final = 1e-9
 """An edge of a graph weighs something, or it is none."""
-_FIRST_SLACK: Final = 0.2
-_MORE_SLACK: Final = 4.0
+_MORE: Final = 1.2
+"""The first bound is so much more than the straight way would cost; each way of cells is up to 8 % longer."""
+_MORE_SLACK: Final = 2.0
 _NO_LIMIT: Final = sys.float_info.max
 _SMOOTHINGS: Final = 20
 
@@ -199,8 +200,10 @@ class _Search:
         self._left = _bordered(left, 0.0)
         self._begin = self._own(begin)
         graph = _edges(_bordered(np.where(free, factors, np.inf), np.inf), self._left, grid.rows, grid.columns)
-        slack = max(_FIRST_SLACK * float(self._left[self._begin]), 1.0)
-        most = float(self._left[self._begin]) * float(factors[free].max(initial=1.0)) + left.size
+        dearest = float(factors[free].max(initial=1.0))
+        straight = _straight(np.where(free, factors, dearest), divmod(begin, grid.columns), (goal_row, goal_column))
+        slack = max(_MORE * straight - float(self._left[self._begin]), 1.0)
+        most = float(self._left[self._begin]) * dearest + left.size
         self._reduced, self._before = self._run(graph, slack)
         while not math.isfinite(self._reduced[self._own(goal)]) and slack < _NO_LIMIT:
             slack = slack * _MORE_SLACK if slack < most else _NO_LIMIT
@@ -227,6 +230,13 @@ class _Search:
         rows, columns = np.divmod(np.array(found[::-1], np.int64), self._columns + 2)
         cells: Indices = (rows - 1) * self._columns + columns - 1
         return cells
+
+
+def _straight(factors: Floats, begin: tuple[int, int], end: tuple[int, int]) -> float:
+    """What the straight way between two cells would cost, in cells' lengths: about what a good one does."""
+    steps = max(abs(end[0] - begin[0]), abs(end[1] - begin[1]), 1)
+    rows, columns = (np.rint(np.linspace(begin[axis], end[axis], steps + 1)).astype(np.intp) for axis in (0, 1))
+    return float(factors[rows, columns].mean()) * math.dist(begin, end)
 
 
 def _bordered(values: Floats, border: float) -> Floats:

@@ -69,6 +69,8 @@ class MppiOptions:
     ax_min: float = -3.0
     az_max: float = 3.5
     retry_attempt_limit: int = 1
+    regenerate_noises: bool = False
+    """Draw anew for each command; else after each reset alone, which takes a fifth of a command less."""
     prune_distance: float = 2.0
     """[m]: how much of the path ahead counts."""
     critics: Critics = field(default_factory=Critics)
@@ -125,9 +127,11 @@ class Mppi:
         self._shifts = abs(options.period_s - options.model_dt) < 1e-6
         self._controls: Floats = np.zeros((options.time_steps, 2))
         self._history: deque[Speed] = deque([(0.0, 0.0)] * _HISTORY, maxlen=_HISTORY)
+        self._noise: Singles | None = None
 
     def reset(self) -> None:
         """Forget the last commands: the robot was stopped, or somebody else drove it."""
+        self._noise = None
         self._controls[:] = 0.0
         self._history.extend([(0.0, 0.0)] * _HISTORY)
 
@@ -210,13 +214,14 @@ class Mppi:
     def _drawn(self, controls: Floats) -> tuple[Singles, Singles]:
         """Controls with noise, (steps, batch) of each."""
         options = self.options
-        shape = options.time_steps, options.batch_size
-        noise = self._generator.standard_normal((2, *shape), dtype=np.float32)
+        noise = self._noise
+        if noise is None:
+            shape = 2, options.time_steps, options.batch_size
+            noise = self._generator.standard_normal(shape, dtype=np.float32)
+            noise *= np.array([options.vx_std, options.wz_std], np.float32)[:, None, None]
+        self._noise = None if options.regenerate_noises else noise
         mean = controls.astype(np.float32)
-        return (
-            mean[:, 0, None] + noise[0] * np.float32(options.vx_std),
-            mean[:, 1, None] + noise[1] * np.float32(options.wz_std),
-        )
+        return mean[:, 0, None] + noise[0], mean[:, 1, None] + noise[1]
 
     def _following(self, task: Task) -> tuple[Singles, Singles]:
         """Controls that follow the path by pure pursuit at some speeds, (steps, speeds) of each."""
