@@ -114,6 +114,9 @@ class CollisionMonitor:
     def __init__(self, options: MonitorOptions | None = None) -> None:
         self.options: Final = options or MonitorOptions()
         self._counts = dict.fromkeys(Action, 0)
+        self._zones_m = max(
+            (math.hypot(*corner) for zone in self.options.polygons for corner in zone.points), default=0.0
+        )
 
     @property
     def counts(self) -> Mapping[Action, int]:
@@ -134,7 +137,9 @@ class CollisionMonitor:
             return Verdict(STOPPED, Action.INVALID)
         if stamp_s is None or not abs(now_s - stamp_s) <= self.options.source_timeout:  # and no NaN
             return Verdict(STOPPED, Action.NO_DATA)
-        points = points_m[np.isfinite(points_m).all(axis=1)]
+        reach_m = max(self._zones_m, self.options.radius + abs(command[0]) * self.options.time_before_collision)
+        # No zone and no circle on the way is further away; and no NaN.
+        points = points_m[np.hypot(points_m[:, 0], points_m[:, 1]) <= reach_m]
         slowest, found = 1.0, Verdict(command, Action.DO_NOT_PROCESS)
         for polygon in self.options.polygons:
             if not polygon.counts_for(command):

@@ -5,8 +5,10 @@ bound that grows until the goal is within it. The heuristic is the shortest way 
 """
 
 import math
+import sys
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -25,8 +27,10 @@ _STEPS: Final = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1
 _SQRT2: Final = math.sqrt(2)
 _LEAST: Final = 1e-9
 """An edge of a graph weighs something, or it is none."""
-_FIRST_SLACK: Final = 0.05
-_MORE_SLACK: Final = 4.0
+_MORE: Final = 1.2
+"""The first bound is so much more than the straight way would cost; each way of cells is up to 8 % longer."""
+_MORE_SLACK: Final = 2.0
+_NO_LIMIT: Final = sys.float_info.max
 _SMOOTHINGS: Final = 20
 
 
@@ -178,24 +182,36 @@ def _nearest(costmap: Costmap, free: Mask, place_m: Point, radius_m: float) -> i
 
 
 class _Search:
-    """A search from one cell, by A* to the goal; to all cells if that is not reached."""
+    """A search from one cell, by A* to the goal; to all cells if that is not reached.
+
+    Its own cells have a border around them that nothing enters, so that each has eight neighbours.
+    """
 
     def __init__(self, costmap: Costmap, free: Mask, begin: int, goal: int, options: PlannerOptions) -> None:
         grid = costmap.grid
-        real, twin = options.cost_travel_multiplier, options.twin_travel_multiplier
-        factors = 1 + (real * costmap.costs.astype(np.float64) + twin * costmap.soft) / MAX_NON_OBSTACLE
-        rows, columns = np.divmod(np.arange(grid.rows * grid.columns), grid.columns)
+        self._columns = grid.columns
+        values = np.arange(256, dtype=np.float64) / MAX_NON_OBSTACLE
+        factors = 1 + options.cost_travel_multiplier * values[costmap.costs]
+        factors += (options.twin_travel_multiplier * values)[costmap.soft]
         goal_row, goal_column = divmod(goal, grid.columns)
-        across, along = np.abs(columns - goal_column), np.abs(rows - goal_row)
-        self._left = np.maximum(across, along) + (_SQRT2 - 1) * np.minimum(across, along)
-        self._begin = begin
-        graph = _edges(free, factors, self._left.reshape(grid.shape))
-        slack = max(_FIRST_SLACK * float(self._left[begin]), 1.0)
-        most = float(self._left[begin]) * float(factors[free].max(initial=1.0)) + len(rows)
+        across = np.abs(np.arange(grid.columns) - goal_column)[None, :]
+        along = np.abs(np.arange(grid.rows) - goal_row)[:, None]
+        left = np.maximum(across, along) + (_SQRT2 - 1) * np.minimum(across, along)
+        self._left = _bordered(left, 0.0)
+        self._begin = self._own(begin)
+        graph = _edges(_bordered(np.where(free, factors, np.inf), np.inf), self._left, grid.rows, grid.columns)
+        dearest = float(factors[free].max(initial=1.0))
+        straight = _straight(np.where(free, factors, dearest), divmod(begin, grid.columns), (goal_row, goal_column))
+        slack = max(_MORE * straight - float(self._left[self._begin]), 1.0)
+        most = float(self._left[self._begin]) * dearest + left.size
         self._reduced, self._before = self._run(graph, slack)
-        while not math.isfinite(self._reduced[goal]) and slack < math.inf:
-            slack = slack * _MORE_SLACK if slack < most else math.inf
+        while not math.isfinite(self._reduced[self._own(goal)]) and slack < _NO_LIMIT:
+            slack = slack * _MORE_SLACK if slack < most else _NO_LIMIT
             self._reduced, self._before = self._run(graph, slack)
+
+    def _own(self, cell: int) -> int:
+        row, column = divmod(cell, self._columns)
+        return (row + 1) * (self._columns + 2) + column + 1
 
     def _run(self, graph: csr_matrix, limit: float) -> tuple[Floats, NDArray[np.int32]]:
         found, before = dijkstra(graph, indices=self._begin, return_predecessors=True, limit=limit)
@@ -203,39 +219,62 @@ class _Search:
 
     def cost(self, cell: int) -> float:
         """What the way to a cell costs, in cells' lengths; inf where none was found."""
-        return float(self._reduced[cell] + self._left[self._begin] - self._left[cell])
+        own = self._own(cell)
+        return float(self._reduced[own] + self._left[self._begin] - self._left[own])
 
     def way(self, cell: int) -> Indices:
         """The cells from the first to this one."""
-        found = [cell]
+        found = [self._own(cell)]
         while found[-1] != self._begin:
             found.append(int(self._before[found[-1]]))
-        return np.array(found[::-1], np.int64)
+        rows, columns = np.divmod(np.array(found[::-1], np.int64), self._columns + 2)
+        cells: Indices = (rows - 1) * self._columns + columns - 1
+        return cells
 
 
-def _edges(free: Mask, factors: Floats, left: Floats) -> csr_matrix:
-    """What each step between free cells costs, less what it comes nearer to the goal: never below 0.
+def _straight(factors: Floats, begin: tuple[int, int], end: tuple[int, int]) -> float:
+    """What the straight way between two cells would cost, in cells' lengths: about what a good one does."""
+    steps = max(abs(end[0] - begin[0]), abs(end[1] - begin[1]), 1)
+    rows, columns = (np.rint(np.linspace(begin[axis], end[axis], steps + 1)).astype(np.intp) for axis in (0, 1))
+    return float(factors[rows, columns].mean()) * math.dist(begin, end)
 
-    It is laid out as the graph's rows are, eight places a cell, of which those that lead nowhere are left out.
+
+def _bordered(values: Floats, border: float) -> Floats:
+    """Values (rows, columns) with one more on each side, flat."""
+    rows, columns = values.shape
+    found = np.full((rows + 2, columns + 2), border)
+    found[1:-1, 1:-1] = values
+    return found.reshape(-1)
+
+
+@lru_cache(maxsize=4)
+def _neighbours(rows: int, columns: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Which cells each cell of a grid with a border has beside it, as a sparse matrix has them: numbers, pointers.
+
+    They are the same for all plans on a grid. Those of the border itself are any: nothing leads to them.
     """
-    rows, columns = free.shape
-    costs = np.full((rows + 2, columns + 2), np.inf, np.float32)
-    costs[1:-1, 1:-1] = np.where(free, factors, np.inf)
-    ahead = np.zeros((rows + 2, columns + 2))
-    ahead[1:-1, 1:-1] = left
-    weights = np.empty((rows, columns, len(_STEPS)), np.float32)
-    numbers = np.empty((rows, columns, len(_STEPS)), np.int32)
-    here = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
+    cells = rows * columns
+    offsets = np.array([up * columns + right for up, right in _STEPS])
+    numbers = (np.arange(cells)[:, None] + offsets) % cells
+    found = numbers.reshape(-1).astype(np.int32), np.arange(0, len(_STEPS) * cells + 1, len(_STEPS), dtype=np.int32)
+    for each in found:
+        each.flags.writeable = False
+    return found
+
+
+def _edges(factors: Floats, left: Floats, rows: int, columns: int) -> csr_matrix:
+    """What each step costs, less what it comes nearer to the goal: never below 0, and inf to what is not free."""
+    wide, cells = columns + 2, len(factors)
+    begin, end = wide + 1, cells - wide - 1
+    straight, across = factors + left, _SQRT2 * factors + left
+    weights = np.full((cells, len(_STEPS)), np.inf)
     for place, (up, right) in enumerate(_STEPS):
-        there = (slice(1 + up, rows + 1 + up), slice(1 + right, columns + 1 + right))
-        length = _SQRT2 if up and right else 1.0
-        weights[..., place] = length * costs[there] + (ahead[there] - left)
-        numbers[..., place] = here + (up * columns + right)
-    kept = np.isfinite(weights) & free[..., None]
-    pointers = np.zeros(rows * columns + 1, np.int32)
-    np.cumsum(kept.sum(axis=-1).reshape(-1), out=pointers[1:])
-    kept_weights = np.maximum(weights[kept], _LEAST)
-    return csr_matrix((kept_weights.astype(np.float64), numbers[kept], pointers), shape=(rows * columns,) * 2)
+        ends = across if up and right else straight
+        offset = up * wide + right
+        np.subtract(ends[begin + offset : end + offset], left[begin:end], out=weights[begin:end, place])
+    np.maximum(weights, _LEAST, out=weights)
+    numbers, pointers = _neighbours(rows + 2, wide)
+    return csr_matrix((weights.reshape(-1), numbers, pointers), shape=(cells, cells))
 
 
 def _smooth(path: Floats, costmap: Costmap, free: Mask) -> Floats:

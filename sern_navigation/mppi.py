@@ -10,6 +10,7 @@ import math
 from collections import deque
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -30,7 +31,7 @@ PATH_STEP_M: Final = 0.05
 _SAVITZKY_GOLAY: Final = np.array([-21, 14, 39, 54, 59, 54, 39, 14, -21], np.float64) / 231
 """Quadratic, nine points (Savitzky and Golay, 1964)."""
 _HISTORY: Final = 4
-_SHARES: Final = np.array([1.0, 0.5, 0.2])
+_SHARES: Final = (1.0, 0.5, 0.2)
 """Of the largest speed: so fast some of the trajectories follow the path."""
 _LOOK_AHEAD_M: Final = 0.4
 _THERE_M: Final = 0.05
@@ -68,6 +69,8 @@ class MppiOptions:
     ax_min: float = -3.0
     az_max: float = 3.5
     retry_attempt_limit: int = 1
+    regenerate_noises: bool = False
+    """Draw anew for each command; else after each reset alone, which takes a fifth of a command less."""
     prune_distance: float = 2.0
     """[m]: how much of the path ahead counts."""
     critics: Critics = field(default_factory=Critics)
@@ -124,9 +127,11 @@ class Mppi:
         self._shifts = abs(options.period_s - options.model_dt) < 1e-6
         self._controls: Floats = np.zeros((options.time_steps, 2))
         self._history: deque[Speed] = deque([(0.0, 0.0)] * _HISTORY, maxlen=_HISTORY)
+        self._noise: Singles | None = None
 
     def reset(self) -> None:
         """Forget the last commands: the robot was stopped, or somebody else drove it."""
+        self._noise = None
         self._controls[:] = 0.0
         self._history.extend([(0.0, 0.0)] * _HISTORY)
 
@@ -181,9 +186,11 @@ class Mppi:
             scores, collide = options.critics.score(batch, task)
             if collide.all():
                 return None
-            controls, alone = self._mean(controls, drawn, scores, speed)
+            controls = self._mean(controls, drawn, scores, speed)
             if self._meets(task, self._driven(task.pose, controls)):
-                controls = alone
+                best = int(np.argmin(scores))
+                alone = np.stack([part[:, best] for part in drawn], axis=1).astype(np.float64)
+                controls = self._within_limits(alone, speed)
         return controls
 
     def _task(self, pose: Pose, path_m: Floats, goal: tuple[float, float, float | None], costmap: Costmap) -> Task:
@@ -207,62 +214,82 @@ class Mppi:
     def _drawn(self, controls: Floats) -> tuple[Singles, Singles]:
         """Controls with noise, (steps, batch) of each."""
         options = self.options
-        shape = options.time_steps, options.batch_size
-        noise = self._generator.standard_normal((2, *shape), dtype=np.float32)
+        noise = self._noise
+        if noise is None:
+            shape = 2, options.time_steps, options.batch_size
+            noise = self._generator.standard_normal(shape, dtype=np.float32)
+            noise *= np.array([options.vx_std, options.wz_std], np.float32)[:, None, None]
+        self._noise = None if options.regenerate_noises else noise
         mean = controls.astype(np.float32)
-        return (
-            mean[:, 0, None] + noise[0] * np.float32(options.vx_std),
-            mean[:, 1, None] + noise[1] * np.float32(options.wz_std),
-        )
+        return mean[:, 0, None] + noise[0], mean[:, 1, None] + noise[1]
 
     def _following(self, task: Task) -> tuple[Singles, Singles]:
         """Controls that follow the path by pure pursuit at some speeds, (steps, speeds) of each."""
         options = self.options
-        x, y, yaw, gone = (np.full(len(_SHARES), value) for value in (*task.pose, 0.0))
-        vx, wz = (np.empty((options.time_steps, len(_SHARES)), np.float32) for _ in range(2))
-        for number in range(options.time_steps):
+        steps = options.time_steps
+        controls = np.empty((2, len(_SHARES), steps), np.float32)
+        along = task.along_m.tolist()
+        easts, norths = task.path_m.T.tolist()
+        for number, share in enumerate(_SHARES):
+            controls[:, number] = self._pursuit(task.pose, share * options.vx_max, along, easts, norths)
+        return controls[0].T, controls[1].T
+
+    def _pursuit(
+        self, pose: Pose, fastest: float, along_m: list[float], easts_m: list[float], norths_m: list[float]
+    ) -> tuple[list[float], list[float]]:
+        """Controls that follow a path by pure pursuit (Coulter, 1992), no faster than this: speeds and yaw rates.
+
+        One after the other in plain numbers: arrays of three would cost more than what is in them.
+        """
+        options, dt = self.options, self.options.model_dt
+        (x, y, yaw), gone, last, segment = pose, 0.0, len(along_m) - 1, 0
+        vx, wz = [], []
+        for _ in range(options.time_steps):
             ahead = gone + _LOOK_AHEAD_M
-            to_x = np.interp(ahead, task.along_m, task.path_m[:, 0]) - x
-            to_y = np.interp(ahead, task.along_m, task.path_m[:, 1]) - y
-            off = np.arctan2(to_y, to_x) - yaw
-            off = off - _TURN * np.round(off / _TURN)
-            there = np.hypot(to_x, to_y) < _THERE_M
-            looks = np.abs(off) < _LOOKS_RAD
-            speed = np.where(looks & ~there, options.vx_max * _SHARES, 0.0)
-            # Towards a point on a circle (Coulter, 1992); on the spot where it lies elsewhere.
-            turn = np.where(looks, 2 * speed * np.sin(off) / _LOOK_AHEAD_M, 2 * off)
-            turn = np.where(there, 0.0, np.clip(turn, -options.wz_max, options.wz_max))
-            vx[number], wz[number] = speed, turn
-            heading = yaw + turn * options.model_dt / 2
-            x, y = x + speed * np.cos(heading) * options.model_dt, y + speed * np.sin(heading) * options.model_dt
-            yaw, gone = yaw + turn * options.model_dt, gone + speed * np.cos(off) * options.model_dt
+            while segment < last - 1 and along_m[segment + 1] < ahead:
+                segment += 1
+            if ahead >= along_m[last]:
+                to_x, to_y = easts_m[last] - x, norths_m[last] - y
+            else:
+                share = (ahead - along_m[segment]) / (along_m[segment + 1] - along_m[segment])
+                to_x = easts_m[segment] + share * (easts_m[segment + 1] - easts_m[segment]) - x
+                to_y = norths_m[segment] + share * (norths_m[segment + 1] - norths_m[segment]) - y
+            off = math.remainder(math.atan2(to_y, to_x) - yaw, _TURN)
+            looks, speed, turn = abs(off) < _LOOKS_RAD, 0.0, 0.0
+            if math.hypot(to_x, to_y) >= _THERE_M:
+                speed = fastest if looks else 0.0
+                # Towards a point on a circle; on the spot where it lies elsewhere.
+                turn = 2 * speed * math.sin(off) / _LOOK_AHEAD_M if looks else 2 * off
+                turn = min(max(turn, -options.wz_max), options.wz_max)
+            vx.append(speed)
+            wz.append(turn)
+            heading = yaw + turn * dt / 2
+            x, y = x + speed * math.cos(heading) * dt, y + speed * math.sin(heading) * dt
+            yaw, gone = yaw + turn * dt, gone + speed * math.cos(off) * dt
         return vx, wz
 
     def _rolled_out(self, pose: Pose, speed: Speed, drawn: tuple[Singles, Singles]) -> Batch:
         """Where controls lead a robot with differential drive, whose speeds change no faster than they can."""
         options = self.options
-        vx, wz = np.empty_like(drawn[0]), np.empty_like(drawn[1])
-        before_x, before_z = np.float32(speed[0]), np.float32(speed[1])
-        step_s = options.period_s
-        for number in range(options.time_steps):
-            np.clip(
-                drawn[0][number], before_x + step_s * options.ax_min, before_x + step_s * options.ax_max, vx[number]
-            )
-            np.clip(
-                drawn[1][number], before_z - step_s * options.az_max, before_z + step_s * options.az_max, wz[number]
-            )
-            before_x, before_z, step_s = vx[number], wz[number], options.model_dt
+        vx, wz = drawn[0].copy(), drawn[1].copy()
+        for controls, now, least, most in (
+            (vx, speed[0], options.ax_min, options.ax_max),
+            (wz, speed[1], -options.az_max, options.az_max),
+        ):
+            before, step_s, limit = np.full_like(controls[0], now), options.period_s, np.empty_like(controls[0])
+            for each in controls:
+                np.maximum(each, np.add(before, step_s * least, out=limit), out=each)
+                np.minimum(each, np.add(before, step_s * most, out=limit), out=each)
+                before, step_s = each, options.model_dt
         dt = np.float32(options.model_dt)
-        yaw = np.cumsum(wz * dt, axis=0) + np.float32(pose[2])
+        yaw = _running_sum(wz * dt) + np.float32(pose[2])
         heading = yaw - wz * (dt / 2)
-        x = np.cumsum(vx * np.cos(heading) * dt, axis=0) + np.float32(pose[0])
-        y = np.cumsum(vx * np.sin(heading) * dt, axis=0) + np.float32(pose[1])
+        x = _running_sum(vx * np.cos(heading) * dt) + np.float32(pose[0])
+        y = _running_sum(vx * np.sin(heading) * dt) + np.float32(pose[1])
         return Batch(x, y, yaw, vx, wz)
 
-    def _mean(
-        self, controls: Floats, drawn: tuple[Singles, Singles], scores: Singles, speed: Speed
-    ) -> tuple[Floats, Floats]:
-        """The mean of what was drawn, by merit, and the one with the most merit; both smooth and within the limits."""
+    def _mean(self, controls: Floats, drawn: tuple[Singles, Singles], scores: Singles, speed: Speed) -> Floats:
+        """The mean of what was drawn, by merit, smooth and within the limits."""
         options = self.options
         total = scores.astype(np.float64)
         for axis, sigma in ((0, options.vx_std), (1, options.wz_std)):
@@ -271,9 +298,7 @@ class Mppi:
         merits = np.exp((total.min() - total) / options.temperature)
         merits = (merits / merits.sum()).astype(np.float32)
         found = np.stack([part @ merits for part in drawn], axis=1).astype(np.float64)
-        best = int(np.argmin(scores))
-        alone = np.stack([part[:, best] for part in drawn], axis=1).astype(np.float64)
-        return self._within_limits(self._smooth(found), speed), self._within_limits(alone, speed)
+        return self._within_limits(self._smooth(found), speed)
 
     def _smooth(self, controls: Floats) -> Floats:
         padded = np.concatenate((np.array(self._history), controls, np.repeat(controls[-1:], _HISTORY, axis=0)))
@@ -302,6 +327,13 @@ class Mppi:
         return np.stack(
             (pose[0] + np.cumsum(steps * np.cos(heading)), pose[1] + np.cumsum(steps * np.sin(heading)), yaw), axis=1
         )
+
+
+def _running_sum(values: Singles) -> Singles:
+    """The sums over the rows up to each, (steps, batch), in place: a row at a time is half of what cumsum takes."""
+    for before, row in pairwise(values):
+        np.add(before, row, out=row)
+    return values
 
 
 def _none(code: ControlCode, message: str) -> Control:

@@ -29,6 +29,7 @@ LIDAR_HEIGHT_M: Final = 0.4
 LIDAR_RANGE_M: Final = 30.0
 RINGS_RAD: Final = np.deg2rad(np.linspace(-15.0, 15.0, 16))
 """Elevations of a 16-ring scanner."""
+_RING_SLOPES: Final = np.tan(RINGS_RAD)
 BATTERY_WH: Final = 270.0
 GRAVITY_MPS2: Final = 9.80665
 GYRO_NOISE_RADPS: Final = 0.003
@@ -129,8 +130,9 @@ class SimulatedJackal:
         turn_goal = clamp(turn_goal, MAX_YAW_RATE_RADPS) * (self.yaw_scale if self.commanded else 1.0)
         turn = approach(before.yaw_rate_radps, turn_goal, MAX_YAW_ACCEL_RADPS2)
         pose = before.pose.moved(speed * STEP_S, turn * STEP_S)
-        clearance = self.world.clearance_m(pose.x_m, pose.y_m)
-        blocked = clearance < BODY_RADIUS_M and clearance < self.world.clearance_m(before.pose.x_m, before.pose.y_m)
+        blocked = self.world.touches(pose.x_m, pose.y_m, BODY_RADIUS_M) and (
+            self.world.clearance_m(pose.x_m, pose.y_m) < self.world.clearance_m(before.pose.x_m, before.pose.y_m)
+        )
         # Against an obstacle the body stands, but the wheels go on turning: the odometry is then wrong.
         moved = Pose2(before.pose.x_m, before.pose.y_m, pose.yaw_rad) if blocked else pose
         wheel_speed, wheel_turn = speed / self.speed_scale, turn / self.yaw_scale
@@ -191,7 +193,7 @@ class SimulatedJackal:
         pick = (np.arange(azimuths) * rays) // azimuths
         bearing = np.linspace(-math.pi, math.pi, azimuths, endpoint=False)
         flat, height = hit.range_m[pick][:, None], hit.height_m[pick][:, None]
-        slope = np.tan(RINGS_RAD)[None, :]
+        slope = _RING_SLOPES[None, :]
         with np.errstate(divide="ignore", invalid="ignore"):
             ground = np.where(slope < 0, LIDAR_HEIGHT_M / -slope, np.inf)
             on_obstacle = flat * slope + LIDAR_HEIGHT_M <= height

@@ -28,6 +28,8 @@ class World:
         self.walls = np.asarray(walls, dtype=np.float64).reshape(-1, 5)
         self.pillars = np.asarray(pillars, dtype=np.float64).reshape(-1, 4)
         self.half_size_m = half_size_m
+        self._known_m = 0.0, 0.0, -math.inf
+        """A place, and the clearance there: that of places near it is not much less."""
 
     @classmethod
     def yard(cls, random: Random, *, half_size_m: float = 10.0, boxes: int = 8, pillars: int = 8) -> "World":
@@ -95,6 +97,15 @@ class World:
             centres = np.hypot(self.pillars[:, 0] - x_m, self.pillars[:, 1] - y_m)
             best = min(best, float(np.min(centres - self.pillars[:, 2])))
         return best
+
+    def touches(self, x_m: float, y_m: float, radius_m: float) -> bool:
+        """Whether a disc around a point meets an obstacle. It is quick for discs that move in small steps."""
+        at_x_m, at_y_m, clearance_m = self._known_m
+        if clearance_m - math.hypot(x_m - at_x_m, y_m - at_y_m) >= radius_m:
+            return False
+        clearance_m = self.clearance_m(x_m, y_m)
+        self._known_m = x_m, y_m, clearance_m
+        return clearance_m < radius_m
 
     def occupancy(self, cells: int) -> NDArray[np.int8]:
         """(cells, cells) grid over the whole world, row 0 at the south: 100 occupied, 0 free."""

@@ -112,7 +112,7 @@ def drive(seed: int, campus: Campus, mode: Mode, *, accuracy: float = 0.9, link:
         robot.drive(command.speed[0], command.speed[1] / robot.yaw_scale_known)
         for _ in range(round(PERIOD_S / STEP_S)):
             here = robot.step().pose
-            touches = robot.world.clearance_m(here.x_m, here.y_m) < BODY_RADIUS_M
+            touches = robot.world.touches(here.x_m, here.y_m, BODY_RADIUS_M)
             collisions += touches and not touching
             touching = touches
     there = status.state is State.SUCCEEDED

@@ -1,5 +1,6 @@
 """The values of a costmap's cells, as in nav2_costmap_2d/cost_values.hpp, and a costmap to read."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -96,7 +97,9 @@ def whole(grid: Grid) -> Window:
 
 def around(grid: Grid, x_m: float, y_m: float, radius_m: float) -> Window:
     """The cells within a square around a place, as far as they are on the grid; none where the place is far off."""
-    low = np.floor((np.array([y_m, x_m]) - radius_m - [grid.south_m, grid.west_m]) / grid.cell_m)
-    high = np.floor((np.array([y_m, x_m]) + radius_m - [grid.south_m, grid.west_m]) / grid.cell_m) + 1
-    rows, columns = (np.clip([low[axis], high[axis]], 0, size).astype(int) for axis, size in enumerate(grid.shape))
-    return Window(int(rows[0]), int(rows[1]), int(columns[0]), int(columns[1]))
+    row, column, cells = (y_m - grid.south_m) / grid.cell_m, (x_m - grid.west_m) / grid.cell_m, radius_m / grid.cell_m
+    rows, columns = (
+        [min(max(math.floor(end), 0), size) for end in (middle - cells, middle + cells + 1)]
+        for middle, size in ((row, grid.rows), (column, grid.columns))
+    )
+    return Window(rows[0], rows[1], columns[0], columns[1])
