@@ -1,7 +1,8 @@
 """Where the twin and what scanners see differ: found at the site of the scanners, told to the others as objects.
 
 A discrepancy is the object `/scene/NAME/discrepancy/NUMBER@CLIENT` of kind discrepancy while it lasts. Its attributes
-say all of it: `kind` (phantom, unknown_obstacle), `east_m`, `north_m` and `radius_m` of the circle around it, `cells`.
+say all of it: `kind` (phantom, unknown_obstacle), `east_m`, `north_m` and `radius_m` of the circle around it, `cells`,
+`corrected` (true, false): whether the live layer of its site says what is there instead.
 """
 
 import math
@@ -26,7 +27,8 @@ MOST_OF_OTHERS: Final = 256
 
 
 class SceneDiscrepancies:
-    """`changes` counts: while it is the same, so is `all`. `unused(reason)` counts what others said and is not kept."""
+    """`changes` counts: while it is the same, so is `all`. `unused(reason)` counts what others said and is not kept.
+    `corrects`: what is found here is corrected on the map (`correction`), and told as such."""
 
     def __init__(
         self,
@@ -35,6 +37,7 @@ class SceneDiscrepancies:
         grid: Grid,
         objects: SiteObjects,
         *,
+        corrects: bool,
         unused: Callable[[Unused], None],
         said: Callable[[str], None],
     ) -> None:
@@ -43,9 +46,11 @@ class SceneDiscrepancies:
         self._client = client
         self._grid = grid
         self._objects = objects
+        self._corrects = corrects
         self._unused = unused
         self._said = said
         self._world = Discrepancies(grid)
+        self._correction: Cells | None = None
         self._found: tuple[Discrepancy, ...] = ()
         self._told: dict[int, tuple[Discrepancy, float]] = {}
         self._gone_s: dict[int, float] = {}
@@ -69,6 +74,12 @@ class SceneDiscrepancies:
         for sight, place_m in sights:
             self._world.saw(sight.free, sight.occupied, place_m)
         self._found = self._world.compare(twin, now_s=now_s, pose_error_m=pose_error_m)
+        self._correction = self._world.correction() if self._corrects else None
+
+    @property
+    def correction(self) -> Cells | None:
+        """What the twin is to have where it is wrong, else unknown. None: nothing is corrected, or was compared."""
+        return self._correction
 
     def tell(self, now_s: float) -> None:
         """Tell the others what was found, and what is over."""
@@ -87,15 +98,21 @@ class SceneDiscrepancies:
             if known is not None and (now_s < known[1] + TOLD_S or self._alike(known[0], thing)):
                 continue
             try:
-                self._objects.put(
-                    self._id(number), ObjectKind.DISCREPANCY, TYPE, attributes=attributes_of(thing, self._grid.frame_id)
-                )
+                attributes = attributes_of(thing, self._grid.frame_id, corrected=self._corrects)
+                self._objects.put(self._id(number), ObjectKind.DISCREPANCY, TYPE, attributes=attributes)
             except (RefusedError, UsageError) as error:
                 self._said(str(error))
                 continue
             self._told[number] = (thing, now_s)
             self._all[self._id(number)] = SeenDiscrepancy(
-                self._id(number), self._client, thing.kind, thing.east_m, thing.north_m, thing.radius_m, thing.cells
+                self._id(number),
+                self._client,
+                thing.kind,
+                thing.east_m,
+                thing.north_m,
+                thing.radius_m,
+                thing.cells,
+                self._corrects,
             )
             self.changes += 1
 
@@ -124,13 +141,14 @@ class SceneDiscrepancies:
         return max(moved_m, abs(one.radius_m - other.radius_m)) < self._grid.cell_m
 
 
-def attributes_of(thing: Discrepancy, frame_id: str) -> dict[str, str]:
+def attributes_of(thing: Discrepancy, frame_id: str, *, corrected: bool) -> dict[str, str]:
     return {
         "kind": thing.kind.value,
         "east_m": f"{thing.east_m:.3f}",
         "north_m": f"{thing.north_m:.3f}",
         "radius_m": f"{thing.radius_m:.3f}",
         "cells": str(thing.cells),
+        "corrected": str(corrected).lower(),
         "frame_id": frame_id,
     }
 
@@ -146,4 +164,5 @@ def read_discrepancy(item: XrObject) -> SeenDiscrepancy | None:
         return None
     if not (abs(east_m) <= MOST_M and abs(north_m) <= MOST_M and 0 < radius_m <= MOST_M and cells > 0):
         return None
-    return SeenDiscrepancy(item.id, str(item.owner), kind, east_m, north_m, radius_m, cells)
+    corrected = said.get("corrected") == "true"
+    return SeenDiscrepancy(item.id, str(item.owner), kind, east_m, north_m, radius_m, cells, corrected)

@@ -71,7 +71,15 @@ def make_scene(
                 f"sern-twin publishes it as {names[key]}: remove the line", file=str(loaded.path), key=f"scene.{key}"
             )
     rates = UpdateRateOptions(**section.rates.model_dump())
-    options = SceneOptions(section.name, scanners, section.obstacles, **names, rates=rates)
+    options = SceneOptions(
+        section.name,
+        scanners,
+        section.obstacles,
+        **names,
+        rates=rates,
+        corrects=section.corrects,
+        lasting=section.lasting,
+    )
     return SceneNode(
         options,
         grid,

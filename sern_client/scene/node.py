@@ -5,7 +5,7 @@ Each block of each layer is an object `/scene/NAME/LAYER/BLOCK@CLIENT` of kind p
 it is now (`sern_twin.world.patches`): whoever missed one is right with the next, and after a blackout only blocks that
 have changed are told. The map is nav_msgs/OccupancyGrid, latched, and what changes in it map_msgs/OccupancyGridUpdate:
 the static layer of a costmap takes both. Where scanners see something else than the twin has is told beside it
-(`differing.py`).
+(`differing.py`), and what they see is what the map has there.
 """
 
 import asyncio
@@ -32,12 +32,23 @@ from sern_core.vocabulary.names import plain_type
 from sern_core.vocabulary.types import Encoding, ObjectKind, TopicName
 from sern_runtime import clock, ros_types
 from sern_runtime.metrics import Metrics
+from sern_twin.world.correction import corrected, map_cells, twin_cells
 from sern_twin.world.discrepancy import DiscrepancyKind, SeenDiscrepancy
 from sern_twin.world.grid import Grid
 from sern_twin.world.mesh import Mesh
 from sern_twin.world.occupancy import Occupancy
 from sern_twin.world.offset import object_offset
-from sern_twin.world.patches import LAYERS, OCCUPIED, UNKNOWN, BlockKey, Cells, Refusal, read_header
+from sern_twin.world.patches import (
+    CLEARED,
+    LASTING,
+    LAYERS,
+    OCCUPIED,
+    UNKNOWN,
+    BlockKey,
+    Cells,
+    Refusal,
+    read_header,
+)
 from sern_twin.world.scene import Scene
 from sern_twin.world.terrain import Terrain
 from sern_twin.world.update_rates import UpdateRates
@@ -115,7 +126,7 @@ class SceneNode:
         self._offsets_due_s = now()
         self._said = SayOnce(_log)
         self.differing = SceneDiscrepancies(
-            options.name, client, grid, objects,
+            options.name, client, grid, objects, corrects=options.corrects,
             unused=self._unused, said=lambda text: self._said(f"scene: {text}", text),
         )  # fmt: skip
         self._differing_due_s = now()
@@ -236,7 +247,8 @@ class SceneNode:
     def tick(self, *, seen: bool) -> None:
         """Tell the others what has changed here, and this site what has changed anywhere."""
         if seen:
-            self.scene.set_cells("live", self.occupancy.classes())
+            seen_cells, correction = self.occupancy.classes(), self.differing.correction
+            self.scene.set_cells("live", seen_cells if correction is None else corrected(seen_cells, correction))
         if self.obstacles.changed:
             self.obstacles.changed = False
             self._paint()
@@ -263,13 +275,19 @@ class SceneNode:
         cells = self.scene.cells("twin_only")
         cells[:] = UNKNOWN
         self.scene.set_cells("twin_only", cells)
-        for marker in self.obstacles.markers.values():
+        lasting = self.options.lasting
+        # What lasts comes last: it is not cleared where something else was added over it.
+        for (namespace, _number), marker in sorted(
+            self.obstacles.markers.items(), key=lambda item: item[0][0] in lasting
+        ):
             if marker.outline is not None:
-                self.scene.paint("twin_only", marker.outline, OCCUPIED)
+                self.scene.paint("twin_only", marker.outline, LASTING if namespace in lasting else OCCUPIED)
 
     def cells(self) -> Cells:
-        """All layers together: what is added over what is seen over what the map says."""
-        return self._together(LAYERS)
+        """All layers together: what is added over what is seen over what the map says, without what scans see through
+        (`sern_twin.world.correction`)."""
+        scene = self.scene
+        return map_cells(scene.merged("base"), scene.merged("live"), scene.merged("twin_only"))
 
     def twin_cells(self) -> Cells:
         """What the twin has without what is seen: what is added over what the map says. To be read alone."""
@@ -278,21 +296,13 @@ class SceneNode:
     def _twin_now(self) -> tuple[Cells, NDArray[np.bool_]]:
         """All cells are looked at when they have changed, and not ten times a second."""
         if self._twin is None:
-            told = self._together(tuple(layer for layer in LAYERS if layer != "live"))
-            self._twin = told, self.scene.merged("twin_only") >= OCCUPIED
+            added = self.scene.merged("twin_only")
+            self._twin = twin_cells(self.scene.merged("base"), added), added >= LASTING
         return self._twin
 
     def discrepancies(self) -> tuple[SeenDiscrepancy, ...]:
         """Where scanners of any site see something else than the twin has."""
         return self.differing.all()
-
-    def _together(self, layers: tuple[str, ...]) -> Cells:
-        found = self.scene.merged(layers[0])
-        for layer in layers[1:]:
-            over = self.scene.merged(layer)
-            known = over != UNKNOWN
-            found[known] = over[known]
-        return found
 
     def ages_s(self) -> NDArray[np.float64]:
         """Seconds since each block was changed here or from elsewhere, (blocks,); NaN: it is as the map has it."""
@@ -367,6 +377,7 @@ class SceneNode:
             "cell_m": self.grid.cell_m,
             "occupied_cells": int((cells >= OCCUPIED).sum()),
             "known_cells": int((cells != UNKNOWN).sum()),
+            "cleared_cells": int((self.scene.merged("live") == CLEARED).sum()),
             "blocks": len(self.scene.versions()),
             "digests": {layer: self.scene.digest(layer) for layer in LAYERS},
             "patches": {outcome.value: count for outcome, count in self.scene.counts.items()},
@@ -383,6 +394,7 @@ class SceneNode:
                     "north_m": each.north_m,
                     "radius_m": each.radius_m,
                     "cells": each.cells,
+                    "corrected": each.corrected,
                 }
                 for each in self.differing.all()
             ],

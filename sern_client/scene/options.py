@@ -22,4 +22,6 @@ class SceneOptions:
     obstacles: str | None = None
     publish: str = "/scene/map"
     discrepancies: str = "/scene/discrepancies"
+    corrects: bool = True
+    lasting: tuple[str, ...] = ("lasting",)
     rates: UpdateRateOptions | None = None

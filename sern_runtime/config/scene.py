@@ -91,6 +91,12 @@ class SceneSection(Section):
     obstacles: TopicText | None = None
     """Topic of this site (local name) by which people add obstacles to the scene: visualization_msgs/Marker, cubes,
     spheres and cylinders, as rviz and scripts publish them; a marker that is deleted is taken back."""
+    lasting: Annotated[tuple[Annotated[str, Field(max_length=100)], ...], Field(max_length=16)] = ("lasting",)
+    """Namespaces of markers that are of holes, or of whatever else no scanner sees: they stay on the map of all sites
+    until they are deleted, and are no phantoms."""
+    corrects: bool = True
+    """Whether what scanners here see corrects the map of all sites: a phantom is free there for as long as it is one,
+    although somebody added it or `base` has it."""
     base: PathText | None = None
     """A map of the site that is the ground of the scene: .osm, .osm.pbf or .geojson. Buildings, barriers and water are
     occupied, roads and paths free. One site is enough."""

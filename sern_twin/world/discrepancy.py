@@ -2,8 +2,10 @@
 
 A cell is occupied, or clear, once three of the last five scans around it said so, and stays that until three of five
 say otherwise: one alone may be off. What they say, the twin may be a match radius off: the twin's place of a wall, the
-cells' size and the robot's own pose are. What is left is joined into discrepancies, each with a
-number that it keeps while it lasts. The robot's own sensors are right, always: the twin is what is to be corrected.
+cells' size and the robot's own pose are. Of what the twin has since then, scans before say nothing. A cell that differs
+does so until the twin or the scans say otherwise, and one scan is too little for that. What is left is joined into
+discrepancies, each with a number that it keeps while it lasts. The robot's own sensors are right, always: `correction`
+is what the twin is to have there.
 """
 
 from collections.abc import Sequence
@@ -17,7 +19,7 @@ from scipy import ndimage
 
 from sern_core.vocabulary.errors import UsageError
 from sern_twin.world.grid import Grid, need_cells
-from sern_twin.world.patches import FREE, OCCUPIED, Cells
+from sern_twin.world.patches import FREE, LASTING, OCCUPIED, UNKNOWN, Cells
 
 SCANS: Final = 5
 AGREEING: Final = 3
@@ -28,6 +30,9 @@ POSE_ERRORS: Final = 2.0
 """The match radius is so many times how far off the robot's pose may be."""
 RANGE_M: Final = 8.0
 """What is further away from a scanner is not compared: half a degree is 7 cm there, and 18 cm at 20 m."""
+RIM_M: Final = 0.5
+"""Scans count so much further: else of a thing at the rim of what is compared the rest would not be known to be clear,
+and it would be told when all of it is near."""
 LEAST_CELLS: Final = 2
 """One cell alone is not said: it flickers at the edges of things."""
 KEEPS_S: Final = 2.0
@@ -72,11 +77,13 @@ class SeenDiscrepancy:
     north_m: float
     radius_m: float
     cells: int
+    corrected: bool = False
+    """Its owner's patches correct it on the map."""
 
     @property
     def says(self) -> str:
         if self.kind is DiscrepancyKind.PHANTOM:
-            return f"phantom: {self.owner} sees nothing there"
+            return f"phantom: {self.owner} sees nothing there" + (", free on the map" if self.corrected else "")
         return f"unknown obstacle: {self.owner} sees it"
 
 
@@ -92,21 +99,28 @@ class Discrepancies:
         """The same: a ray passed."""
         self._occupied: Mask = np.zeros(grid.shape, np.bool_)
         self._clear: Mask = np.zeros(grid.shape, np.bool_)
+        self._had: Mask | None = None
+        """Cells in which the twin had something in the last comparison."""
+        self._compared: Mask = np.zeros(grid.shape, np.bool_)
+        """Cells that were within `RANGE_M` of a scan."""
         self._found: dict[DiscrepancyKind, Mask] = {kind: np.zeros(grid.shape, np.bool_) for kind in DiscrepancyKind}
         self._known: list[tuple[Discrepancy, NDArray[np.int64], float]] = []
         """Those of the last moments, with their cells and when they were found last; the newest first."""
+        self._told: tuple[tuple[DiscrepancyKind, NDArray[np.int64]], ...] = ()
         self._numbers = 0
         self.left_out = 0
 
     def saw(self, free: Mask, occupied: Mask, from_m: tuple[float, float] | None = None) -> None:
         """One scan: through which cells it saw, and in which it ended, (rows, columns) each. `from_m`: where its
-        scanner was; what is further than `RANGE_M` from there says nothing. None: all counts.
+        scanner was; what is further than `RANGE_M` and a rim from there says nothing. None: all counts.
 
         UsageError: another shape than the grid's.
         """
         if free.shape != self._grid.shape or occupied.shape != self._grid.shape:
             raise UsageError(f"a scan of {free.shape} and {occupied.shape} cells on a grid of {self._grid.shape}")
-        rows, columns, around = self._around(from_m)
+        rows, columns, around = self._around(from_m, RANGE_M)
+        self._compared[rows, columns] |= around
+        rows, columns, around = self._around(from_m, RANGE_M + RIM_M)
         ends, passes = self._ends[rows, columns], self._passes[rows, columns]
         ended, passed = occupied[rows, columns], free[rows, columns]
         for bits, said in ((ends, ended), (passes, passed & ~ended)):
@@ -115,15 +129,15 @@ class Discrepancies:
         for state, begins, over in ((self._occupied, ended, passed), (self._clear, passed, ended)):
             state[rows, columns] = (state[rows, columns] | begins) & ~over
 
-    def _around(self, place_m: tuple[float, float] | None) -> tuple[slice, slice, Mask]:
+    def _around(self, place_m: tuple[float, float] | None, range_m: float) -> tuple[slice, slice, Mask]:
         """Cells that are so near to a place: a rectangle, and which of its cells."""
         grid = self._grid
         if place_m is None:
             return slice(0, grid.rows), slice(0, grid.columns), np.ones(grid.shape, np.bool_)
         across = grid.centres(0, np.arange(grid.columns))[:, 0] - place_m[0]
         along = grid.centres(np.arange(grid.rows), 0)[:, 1] - place_m[1]
-        rows, columns = (slice(*np.searchsorted(apart_m, (-RANGE_M, RANGE_M)).tolist()) for apart_m in (along, across))
-        near: Mask = along[rows, None] ** 2 + across[columns] ** 2 <= RANGE_M**2
+        rows, columns = (slice(*np.searchsorted(apart_m, (-range_m, range_m)).tolist()) for apart_m in (along, across))
+        near: Mask = along[rows, None] ** 2 + across[columns] ** 2 <= range_m**2
         return rows, columns, near
 
     @property
@@ -140,6 +154,14 @@ class Discrepancies:
         """Cells of all discrepancies of a kind, as of the last comparison, single ones too."""
         return self._found[kind].copy()
 
+    def correction(self) -> Cells:
+        """What the twin is to have by the last comparison, (rows, columns): free in phantoms that it gave, occupied in
+        unknown obstacles, and unknown where it is not wrong."""
+        found: Cells = np.full(self._grid.shape, UNKNOWN, np.int8)
+        for kind, cells in self._told:
+            found.reshape(-1)[cells] = FREE if kind is DiscrepancyKind.PHANTOM else OCCUPIED
+        return found
+
     def unobserved(self, twin: Cells) -> Mask:
         """Cells that the twin has something in, and of which the scans say nothing."""
         need_cells(twin, self._grid.shape, "a twin")
@@ -147,25 +169,34 @@ class Discrepancies:
         return unseen
 
     def compare(self, twin: Cells, *, now_s: float, pose_error_m: float = 0.0) -> tuple[Discrepancy, ...]:
-        """What is not as the twin has it, (rows, columns); unknown cells of the twin are no discrepancy.
+        """What is not as the twin has it, (rows, columns); unknown and LASTING cells of the twin are no discrepancy.
 
         UsageError: cells that are not the grid's, a pose error that is below 0 or not finite.
         """
         need_cells(twin, self._grid.shape, "a twin")
         if not 0 <= pose_error_m < np.inf:
             raise UsageError(f"a pose error of {pose_error_m} m")
-        has, occupied = twin >= OCCUPIED, self._occupied
+        has, occupied, compared = twin >= OCCUPIED, self._occupied, self._compared
+        if self._had is not None:
+            # It may have come since: what was seen through before is to be seen through again.
+            new = has & ~self._had
+            self._clear[new], self._passes[new] = False, 0
+        self._had = has
         # Rays that graze a wall see through its outermost cells: a phantom is clear as deep as the twin may be off, and
         # one end in it speaks for it.
         anything = occupied | (self._ends > 0) | (has & ~self._clear)
         radius_cells = max(float(RADIUS_CELLS), POSE_ERRORS * pose_error_m / self._grid.cell_m)
+        seen_through, not_known = has & self._clear & compared, (twin == FREE) & occupied & compared
+        before = self._found[DiscrepancyKind.PHANTOM] & seen_through
+        phantom = _beyond(seen_through, anything, radius_cells) | _beyond(before, occupied, radius_cells)
         self._found = {
-            DiscrepancyKind.PHANTOM: _beyond(has & self._clear, anything, radius_cells),
-            DiscrepancyKind.UNKNOWN_OBSTACLE: _beyond((twin == FREE) & occupied, has, radius_cells),
+            DiscrepancyKind.PHANTOM: phantom,
+            DiscrepancyKind.UNKNOWN_OBSTACLE: _beyond(not_known, twin >= LASTING, radius_cells),
         }
         found = [each for kind, mask in self._found.items() for each in self._joined(kind, mask, now_s)]
         found.sort(key=lambda each: -each[0].cells)
         self.left_out = max(0, len(found) - MOST)
+        self._told = tuple((thing.kind, cells) for thing, cells in found[:MOST])
         return self._numbered(found[:MOST], now_s)
 
     def _joined(self, kind: DiscrepancyKind, mask: Mask, now_s: float) -> list[tuple[Discrepancy, NDArray[np.int64]]]:

@@ -18,6 +18,8 @@ from sern_core.vocabulary.errors import UsageError
 from sern_twin.motion import MOST_M
 from sern_twin.world.grid import Floats, Grid, need_cells
 from sern_twin.world.patches import (
+    CLEARED,
+    FREE,
     LAYERS,
     MOST_VERSION,
     UNKNOWN,
@@ -231,7 +233,8 @@ class Scene:
     def merged(self, layer: str) -> Cells:
         """For each cell what the newest block says in which it is not unknown, (rows, columns), a copy.
 
-        Newest is by block, not by cell: who changes a cell says the others of its block anew.
+        Newest is by block, not by cell: who changes a cell says the others of its block anew. A cell that is CLEARED
+        stays so where a newer block says FREE.
 
         UsageError: no such layer.
         """
@@ -312,7 +315,8 @@ def _newest(said: Iterable[tuple[int, str, Cells]]) -> Cells:
     ]
     found = oldest.copy()
     for cells in newer:
-        np.copyto(found, cells, where=cells != UNKNOWN)
+        # Who sees that a cell is free does not say that what was cleared there is right.
+        np.copyto(found, cells, where=(cells != UNKNOWN) & ~((cells == FREE) & (found == CLEARED)))
     return found
 
 

@@ -10,7 +10,7 @@ from sern_client.daemon import ClientDaemon
 from sern_client.scene.node import SceneNode
 from sern_core.vocabulary.types import Encoding, TopicName
 from sern_twin.world.discrepancy import DiscrepancyKind
-from sern_twin.world.patches import OCCUPIED
+from sern_twin.world.patches import FREE, OCCUPIED
 from tests.daemons import Json, Lab
 from tests.sern_client.scene.test_scene_node import marker
 from tests.support import until
@@ -68,6 +68,10 @@ async def test_the_twin_publishes_the_scene_and_what_is_wrong_in_it_for_a_site_w
         node_of(site).obstacles.heard(marker(x_m=x_m, y_m=y_m, size_m=0.5), Encoding.CDR)
         await until(lambda: any(node_of(twin).discrepancies()), "the twin is told of a phantom")
         assert {each.kind for each in node_of(twin).discrepancies()} == {DiscrepancyKind.PHANTOM}
+        cell = tuple(int(value) for value in here.grid.index([x_m, y_m]))
+        nodes = [node_of(daemon) for daemon in (robot, site, twin)]
+        await until(lambda: all(node.cells()[cell] == FREE for node in nodes), "a patch has corrected it everywhere")
+        assert [node.scene.merged("twin_only")[cell] for node in nodes] == [OCCUPIED] * 3, "what was added stays"
         wanted = [TopicName(f"/twin/scene/{part}") for part in ("map", "discrepancies")]
         arrived = other.core.received.topics
         await until(

@@ -2,6 +2,7 @@
 
 import logging
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from sern_core.vocabulary.types import Encoding, ObjectKind
 from sern_runtime import ros_types
 from sern_twin.world.discrepancy import DiscrepancyKind
 from sern_twin.world.patches import FREE, OCCUPIED
-from tests.sern_client.scene.test_scene_node import GRID, Air, Site, around, told
+from tests.sern_client.scene.test_scene_node import GRID, OPTIONS, Air, Site, around, told
 
 
 def drive(robot: Site, ranges_m: Any, scans: int = 1) -> None:
@@ -54,7 +55,7 @@ def test_what_is_added_where_the_robot_sees_nothing_is_a_phantom_in_less_than_a_
     assert (cylinder.ns, cylinder.type, cylinder.header.frame_id) == ("phantom", 3, "odom")
     assert (cylinder.pose.position.x, cylinder.pose.position.y) == pytest.approx((2.0, 0.0), abs=0.06)
     assert cylinder.scale.x == pytest.approx(2 * phantom.radius_m, abs=0.01)
-    assert (text.ns, text.type, text.text) == ("phantom_text", 9, "phantom: robot sees nothing there")
+    assert (text.ns, text.type, text.text) == ("phantom_text", 9, "phantom: robot sees nothing there, free on the map")
     told_of: Any = site.node.to_json()["discrepancies"]
     assert [(each["id"], each["seen_by"]) for each in told_of] == [("/scene/yard/discrepancy/1@robot", "robot")]
     site.marker(action=2)
@@ -63,6 +64,105 @@ def test_what_is_added_where_the_robot_sees_nothing_is_a_phantom_in_less_than_a_
     site.now += 1.0
     site.turn()
     assert site.node.discrepancies() == () and markers(site) == [], "it was taken back"
+
+
+def at(site: Site, x_m: float, y_m: float) -> int:
+    """What the site's map has there."""
+    return int(site.node.cells()[GRID.index(np.array([x_m, y_m]))])
+
+
+def test_a_phantom_is_free_on_all_maps_with_the_next_update_and_stays_among_the_objects() -> None:
+    site, robot = a_pair()
+    site.marker(x_m=2.0, y_m=0.0, size_m=0.6)
+    site.turn()
+    assert at(site, 2.0, 0.0) == at(robot, 2.0, 0.0) == OCCUPIED
+    drive(robot, around(9.0, 9.0, 0.1), scans=2)
+    assert at(robot, 2.0, 0.0) == OCCUPIED, "two scans say nothing yet"
+    updates = len(robot.published.get("/scene/map_updates", ()))
+    drive(robot, around(9.0, 9.0, 0.1))
+    assert at(site, 2.0, 0.0) == at(robot, 2.0, 0.0) == FREE
+    row, column = (int(value) for value in GRID.index(np.array([2.0, 0.0])))
+    patches = [
+        ros_types.deserialise(body, bodies.UPDATE, Encoding.CDR)
+        for body in robot.published["/scene/map_updates"][updates:]
+    ]
+    (there,) = [
+        patch
+        for patch in patches
+        if patch.x <= column < patch.x + patch.width and patch.y <= row < patch.y + patch.height
+    ]
+    assert np.asarray(there.data).reshape(there.height, there.width)[row - there.y, column - there.x] == FREE
+    (phantom,) = site.node.discrepancies()
+    assert phantom.corrected and site.node.scene.merged("twin_only")[row, column] == OCCUPIED
+    shown: Any = site.node.to_json()
+    assert shown["obstacles"] == 1 and shown["cleared_cells"] >= 30 and shown["discrepancies"][0]["corrected"] is True
+    blind = np.full(100, math.nan)
+    drive(robot, blind, scans=20)
+    assert at(site, 2.0, 0.0) == FREE, "the robot looks elsewhere"
+
+
+def test_a_correction_is_undone_when_scans_say_otherwise() -> None:
+    site, robot = a_pair()
+    site.marker(x_m=2.0, y_m=0.0, size_m=0.6)
+    site.turn()
+    drive(robot, around(9.0, 9.0, 0.1), scans=5)
+    assert at(site, 2.0, 0.0) == FREE
+    drive(robot, around(2.0, 0.0, 0.3), scans=2)
+    assert at(robot, 1.75, 0.0) == FREE, "two scans are not sure"
+    drive(robot, around(2.0, 0.0, 0.3))
+    for x_m in (1.75, 1.85):
+        assert at(site, x_m, 0.0) == at(robot, x_m, 0.0) == OCCUPIED
+
+
+def test_what_was_taken_back_and_is_added_again_is_on_the_map_until_it_is_seen_through_again() -> None:
+    site, robot = a_pair()
+    site.marker(x_m=2.0, y_m=0.0, size_m=0.6)
+    site.turn()
+    drive(robot, around(9.0, 9.0, 0.1), scans=5)
+    site.marker(action=2)
+    site.turn()
+    drive(robot, around(9.0, 9.0, 0.1), scans=8)
+    assert site.node.discrepancies() == () and at(site, 2.0, 0.0) == FREE
+    site.marker(x_m=2.0, y_m=0.0, size_m=0.6)
+    site.turn()
+    drive(robot, np.full(100, math.nan), scans=3)
+    assert at(site, 2.0, 0.0) == at(robot, 2.0, 0.0) == OCCUPIED
+    drive(robot, around(9.0, 9.0, 0.1), scans=3)
+    assert at(site, 2.0, 0.0) == FREE
+
+
+def test_what_scanners_cannot_see_stays_on_the_map() -> None:
+    site, robot = a_pair()
+    site.marker(x_m=2.0, y_m=0.0, size_m=0.6, namespace="lasting")
+    site.marker(x_m=2.0, y_m=0.0, size_m=1.0, number=2)
+    site.turn()
+    drive(robot, around(9.0, 9.0, 0.1), scans=20)
+    assert at(site, 2.0, 0.0) == at(robot, 2.0, 0.0) == OCCUPIED, "a hole"
+    assert at(site, 2.0, 0.45) == at(robot, 2.0, 0.45) == FREE, "what somebody else put around it"
+
+
+def test_a_site_may_leave_the_map_as_it_is() -> None:
+    air = Air()
+    site = Site(air, "site")
+    robot = Site(air, "robot", options=replace(OPTIONS, corrects=False))
+    site.marker(x_m=2.0, y_m=0.0, size_m=0.6)
+    site.turn()
+    drive(robot, around(9.0, 9.0, 0.1), scans=20)
+    site.now += 1.0
+    site.turn()
+    assert at(site, 2.0, 0.0) == at(robot, 2.0, 0.0) == OCCUPIED
+    (phantom,) = site.node.discrepancies()
+    assert not phantom.corrected and markers(site)[1].text == "phantom: robot sees nothing there"
+
+
+def test_what_the_map_has_and_the_robot_sees_through_is_free_before_all_scans_are_sure() -> None:
+    base = np.full(GRID.shape, FREE, np.int8)
+    base[50:58, 68:76] = OCCUPIED
+    site, robot = a_pair(base=base)
+    site.turn()
+    drive(robot, around(9.0, 9.0, 0.1), scans=3)
+    assert at(site, 2.2, 0.4) == at(robot, 2.2, 0.4) == FREE
+    assert robot.node.occupancy.classes()[54, 72] != FREE, "the log-odds are not there yet"
 
 
 def test_what_the_robot_sees_where_the_map_is_free_is_an_unknown_obstacle() -> None:
@@ -173,7 +273,7 @@ def test_what_flickers_is_one_discrepancy_and_ends_once() -> None:
     robot.air.delete = lambda client, object_id: said.append(("delete", object_id))  # type: ignore[method-assign]
     there, gone = robot.node.twin_cells(), np.full(GRID.shape, -1, np.int8)
     for step in range(40):
-        robot.node.twin_cells = lambda step=step: gone if step % 3 == 2 else there  # type: ignore[method-assign, misc]
+        robot.node.twin_cells = lambda step=step: gone if step % 6 == 5 else there  # type: ignore[method-assign, misc]
         drive(robot, around(9.0, 9.0, 0.1))
     robot.node.twin_cells = lambda: gone  # type: ignore[method-assign]
     drive(robot, around(9.0, 9.0, 0.1), scans=10)

@@ -68,14 +68,21 @@ class Site:
     """A scene with what it published, and the topics that it hears."""
 
     def __init__(
-        self, air: Air, name: str, *, grid: Grid = GRID, base: Cells | None = None, wall_s: int = 1000
+        self,
+        air: Air,
+        name: str,
+        *,
+        grid: Grid = GRID,
+        base: Cells | None = None,
+        wall_s: int = 1000,
+        options: SceneOptions = OPTIONS,
     ) -> None:
         self.air, self.name = air, name
         self.now = 0.0
         self.sinks: dict[str, list[Any]] = {}
         self.published: dict[str, list[bytes]] = {}
         self.node = SceneNode(
-            OPTIONS,
+            options,
             grid,
             name,
             base=base,
@@ -166,13 +173,13 @@ class Site:
 
 def marker(
     number: int = 0, *, x_m: float = 1.0, y_m: float = 2.0, size_m: float = 1.0, kind: int = 1, action: int = 0,
-    frame_id: str = "odom", yaw_rad: float = 0.0,
+    frame_id: str = "odom", yaw_rad: float = 0.0, namespace: str = "test",
 ) -> bytes:  # fmt: skip
     new, encoding = ros_types.new, Encoding.CDR
     place = new("geometry_msgs/msg/Point", encoding, x=x_m, y=y_m)
     turn = new("geometry_msgs/msg/Quaternion", encoding, z=math.sin(yaw_rad / 2), w=math.cos(yaw_rad / 2))
     message = new(
-        bodies.MARKER, encoding, header=ros_types.header(0, frame_id, encoding), ns="test", id=number, type=kind,
+        bodies.MARKER, encoding, header=ros_types.header(0, frame_id, encoding), ns=namespace, id=number, type=kind,
         action=action, pose=new("geometry_msgs/msg/Pose", encoding, position=place, orientation=turn),
         scale=new("geometry_msgs/msg/Vector3", encoding, x=size_m, y=size_m, z=1.0),
     )  # fmt: skip

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from sern_core.vocabulary.errors import UsageError
-from sern_twin.world.discrepancy import MOST, Discrepancies, Discrepancy, DiscrepancyKind
+from sern_twin.world.discrepancy import MOST, RANGE_M, RIM_M, Discrepancies, Discrepancy, DiscrepancyKind
 from sern_twin.world.grid import Grid
-from sern_twin.world.patches import FREE, OCCUPIED, UNKNOWN, Cells
+from sern_twin.world.patches import FREE, LASTING, OCCUPIED, UNKNOWN, Cells
 
 GRID = Grid(0.0, 0.0, 0.1, 100, 80)
 PHANTOM, UNKNOWN_OBSTACLE = DiscrepancyKind.PHANTOM, DiscrepancyKind.UNKNOWN_OBSTACLE
@@ -208,6 +208,9 @@ def test_the_face_of_a_wall_that_rays_graze_is_no_phantom() -> None:
         world.saw(free, np.zeros(GRID.shape, np.bool_))
     assert world.compare(twin(wall=(slice(20, 24), slice(0, 100))), now_s=1.0) == ()
     fence = twin(fence=(slice(19, 20), slice(0, 100)))
+    world.compare(fence, now_s=1.0)
+    for _ in range(3):
+        world.saw(free, np.zeros(GRID.shape, np.bool_))
     assert [each.kind for each in world.compare(fence, now_s=2.0)] == [PHANTOM], "a thin thing that they see through"
 
 
@@ -221,6 +224,71 @@ def test_what_only_the_scans_saw_that_were_off_is_nothing() -> None:
     for step in range(100):
         world.saw(free, behind if step % 5 == 0 else wall)
     assert world.compare(twin(wall=(slice(20, 21), slice(0, 100))), now_s=1.0) == ()
+
+
+def test_a_thing_at_the_rim_of_what_is_compared_is_told_when_two_of_its_cells_are_within() -> None:
+    """What is beyond is known to be clear by then, so that what is within is no edge of something that may be there."""
+    world, car = Discrepancies(GRID), twin(car=(slice(20, 30), slice(85, 98)))
+    free, nothing = np.ones(GRID.shape, np.bool_), np.zeros(GRID.shape, np.bool_)
+    for _ in range(5):
+        world.saw(free, nothing, (0.25, 2.5))
+    assert world.compare(car, now_s=1.0) == (), "its next cells are 8.3 m away"
+    for step in range(3):
+        world.saw(free, nothing, (0.57, 2.5))
+        found = world.compare(car, now_s=1.1 + 0.1 * step)
+    assert [each.kind for each in found] == [PHANTOM] and found[0].east_m < 8.6
+    assert RANGE_M < 8.5 <= RANGE_M + RIM_M
+
+
+def test_scans_say_nothing_of_what_the_twin_has_since() -> None:
+    """A robot has seen a place and left it; later somebody says that a car stands there."""
+    world = Discrepancies(GRID)
+    scans(world, 20)
+    assert world.compare(twin(), now_s=1.0) == ()
+    assert world.compare(twin(car=CAR), now_s=60.0) == () and world.unobserved(twin(car=CAR)).sum() == 200
+    scans(world, 2)
+    assert world.compare(twin(car=CAR), now_s=60.2) == ()
+    scans(world, 1)
+    assert [each.kind for each in world.compare(twin(car=CAR), now_s=60.3)] == [PHANTOM], "it was seen through since"
+
+
+def test_a_phantom_stays_one_until_three_of_five_scans_end_there() -> None:
+    world = Discrepancies(GRID)
+    scans(world, 3)
+    assert len(world.compare(twin(car=CAR), now_s=1.0)) == 1
+    for step in range(20):
+        scans(world, 2, CAR) if step % 4 == 0 else scans(world, 1)
+        assert [each.cells for each in world.compare(twin(car=CAR), now_s=2.0)] == [200]
+    scans(world, 3, CAR)
+    assert world.compare(twin(car=CAR), now_s=3.0) == ()
+
+
+def test_what_the_twin_is_to_have_is_what_scans_say_of_what_was_told() -> None:
+    world, alone = Discrepancies(GRID), (slice(70, 71), slice(70, 71))
+    new = (slice(50, 54), slice(10, 20))
+    assert (world.correction() == UNKNOWN).all()
+    scans(world, 3, new)
+    world.compare(twin(car=CAR, alone=alone), now_s=1.0)
+    expected = np.full(GRID.shape, UNKNOWN, np.int8)
+    expected[CAR], expected[new] = FREE, OCCUPIED
+    assert np.array_equal(world.correction(), expected), "a cell alone is not told"
+    scans(world, 3, CAR)
+    world.compare(twin(car=CAR, alone=alone), now_s=2.0)
+    assert (world.correction() == UNKNOWN).all(), "the scans say otherwise"
+    scans(world, 5)
+    world.compare(twin(car=CAR), now_s=3.0)
+    assert (world.correction()[CAR] == FREE).all()
+    world.compare(twin(), now_s=4.0)
+    assert (world.correction() == UNKNOWN).all(), "it was taken back"
+
+
+def test_what_scans_cannot_see_is_no_phantom_and_makes_nothing_unknown() -> None:
+    world, hole = Discrepancies(GRID), twin()
+    hole[CAR] = LASTING
+    scans(world, 5)
+    assert world.compare(hole, now_s=1.0) == ()
+    scans(world, 5, CAR)
+    assert world.compare(hole, now_s=2.0) == () and (world.correction() == UNKNOWN).all()
 
 
 def test_what_is_of_another_grid_is_refused() -> None:
