@@ -14,7 +14,7 @@ from torch.nn import functional
 from sern_perception.classes import CLASSES
 from sern_perception.projection import CHANNELS
 
-SCALES: Final = (10.0, 10.0, 2.0, 1.0, 15.0)
+SCALES: Final = (10.0, 10.0, 2.0, 100.0, 15.0)
 """What x, y, z, intensity and range are divided by, so that all are about 1."""
 WIDTHS: Final = (32, 48, 64, 96)
 

@@ -20,6 +20,7 @@ from sern_sim.terrain import Block, Label, Terrain
 FREE_M: Final = 0.7
 """A scanner is set down no nearer to anything."""
 REFLECTS: Final = {Label.GROUND: 0.25, Label.CAR: 0.8, Label.BRIDGE: 0.5, Label.LOG: 0.35, Label.OTHER: 0.6}
+INTENSITY_NOISE_PERCENT: Final = 3.0
 Floats = NDArray[np.float32]
 
 
@@ -101,9 +102,9 @@ def places(random: Random, world: Terrain, count: int) -> list[Pose2]:
 
 
 def cloud(jackal: MujocoJackal, sensor: Sensor, noise: np.random.Generator) -> Floats:
-    """(rows * columns, 5): x, y, z in the sensor's frame, intensity and label; NaN where no return came."""
+    """(rows * columns, 5): x, y, z in the sensor's frame [m], intensity [%] and label; NaN where no return came."""
     elevations = np.linspace(sensor.high_rad, sensor.low_rad, sensor.rows)[:, None]
-    bearings = math.pi - (np.arange(sensor.columns) + 0.5) / sensor.columns * math.tau
+    bearings = math.pi - np.arange(sensor.columns) / sensor.columns * math.tau
     rays = np.empty((sensor.rows, sensor.columns, 3))
     rays[..., 0] = np.cos(elevations) * np.cos(bearings)
     rays[..., 1] = np.cos(elevations) * np.sin(bearings)
@@ -127,7 +128,7 @@ def _intensity(
 ) -> NDArray[np.float64]:
     ranges_m = np.linalg.norm(points_m, axis=1)
     if not sensor.reflects:
-        plain: NDArray[np.float64] = np.nan_to_num(1.0 / (1.0 + ranges_m))
+        plain: NDArray[np.float64] = np.nan_to_num(100.0 / (1.0 + ranges_m))
         return plain
     reflects = np.zeros(int(max(Label)) + 1)
     for label, share in REFLECTS.items():
@@ -136,8 +137,9 @@ def _intensity(
     across, up = np.roll(image, -1, axis=1) - image, np.roll(image, -1, axis=0) - image
     normals = np.cross(across, up).reshape(-1, 3)
     facing = np.abs((normals * points_m).sum(axis=1)) / (np.linalg.norm(normals, axis=1) * ranges_m + 1e-9)
-    said = reflects[labels] * (0.2 + 0.8 * np.nan_to_num(facing, nan=0.5)) * np.exp(-ranges_m / 40.0)
-    found: NDArray[np.float64] = np.nan_to_num(np.clip(said + noise.normal(0.0, 0.03, len(said)), 0.0, 1.0))
+    said = 100.0 * reflects[labels] * (0.2 + 0.8 * np.nan_to_num(facing, nan=0.5)) * np.exp(-ranges_m / 40.0)
+    noisy = said + noise.normal(0.0, INTENSITY_NOISE_PERCENT, len(said))
+    found: NDArray[np.float64] = np.nan_to_num(np.clip(noisy, 0.0, 100.0))
     return found
 
 
