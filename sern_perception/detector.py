@@ -26,6 +26,9 @@ SAME_RAD: Final = math.radians(10.0)
 SAME_M: Final = 0.3
 """Or where the two points are so near: the side of a thing is met at a sharp angle."""
 FEWEST: Final = 3
+GAP: Final = 2
+"""Rays that far apart are neighbours where no ray between them came back: scanners lose single points, and two rays of
+one that is not in step with the columns may share a pixel."""
 SOFT_M: Final = 0.03
 """Two points of one ring are on the ground within so much of each other, whatever the angle: it is noisy."""
 
@@ -74,9 +77,11 @@ def clusters(image: RangeImage, shape: ImageShape) -> list[Cluster]:
     numbers[stands] = np.arange(len(places))
     if not len(places):
         return []
+    ring_rad, column_rad = (shape.high_rad - shape.low_rad) / (shape.rows - 1), math.tau / shape.columns
     joined = [
-        _joined(image.channels[4], numbers, 0, math.tau / shape.columns),
-        _joined(image.channels[4], numbers, 1, (shape.high_rad - shape.low_rad) / (shape.rows - 1)),
+        _joined(image, numbers, axis, gap, gap * step_rad)
+        for axis, step_rad in ((1, column_rad), (0, ring_rad))
+        for gap in range(1, GAP + 1)
     ]
     ends = np.concatenate(joined)
     edges = sparse.coo_matrix((np.ones(len(ends), np.int8), (ends[:, 0], ends[:, 1])), shape=(len(places),) * 2)
@@ -109,16 +114,18 @@ def standing(image: RangeImage, shape: ImageShape) -> NDArray[np.bool_]:
     return found
 
 
-def _joined(ranges_m: NDArray[np.float32], numbers: NDArray[np.int64], axis: int, step_rad: float) -> NDArray[np.int64]:
-    """Pairs of numbers, (n, 2), of neighbours in a ring (axis 0, which is round) or a column that are one surface."""
+def _joined(image: RangeImage, numbers: NDArray[np.int64], axis: int, gap: int, apart_rad: float) -> NDArray[np.int64]:
+    """Pairs of numbers, (n, 2), of neighbours in a column (axis 0) or a ring (axis 1, which is round) that are one
+    surface, `gap` pixels apart with nothing seen between them."""
+    ranges_m = image.channels[4]
+    there, far_m = np.roll(numbers, -gap, axis=axis), np.roll(ranges_m, -gap, axis=axis)
+    both = (numbers >= 0) & (there >= 0)
+    for between in range(1, gap):
+        both &= ~np.roll(image.seen, -between, axis=axis)
     if axis == 0:
-        here, there = numbers, np.roll(numbers, -1, axis=1)
-        near_m, far_m = ranges_m, np.roll(ranges_m, -1, axis=1)
-    else:
-        here, there, near_m, far_m = numbers[:-1], numbers[1:], ranges_m[:-1], ranges_m[1:]
-    both = (here >= 0) & (there >= 0)
-    longer, shorter = np.maximum(near_m, far_m)[both], np.minimum(near_m, far_m)[both]
-    angle = np.arctan2(shorter * math.sin(step_rad), longer - shorter * math.cos(step_rad))
-    apart_m = np.sqrt(longer**2 + shorter**2 - 2 * longer * shorter * math.cos(step_rad))
+        both[-gap:] = False
+    longer, shorter = np.maximum(ranges_m, far_m)[both], np.minimum(ranges_m, far_m)[both]
+    angle = np.arctan2(shorter * math.sin(apart_rad), longer - shorter * math.cos(apart_rad))
+    apart_m = np.sqrt(longer**2 + shorter**2 - 2 * longer * shorter * math.cos(apart_rad))
     one = (angle > SAME_RAD) | (apart_m <= SAME_M)
-    return np.stack((here[both][one], there[both][one]), axis=1)
+    return np.stack((numbers[both][one], there[both][one]), axis=1)

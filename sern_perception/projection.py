@@ -1,4 +1,6 @@
-"""Clouds as range images: rows of elevations from top to bottom, columns of bearings from left over ahead to right.
+"""Clouds as range images: rows of elevations from top to bottom, columns of bearings from behind over left, ahead and
+right. The middle of column c is at a bearing of half a turn less c steps, so that a scanner whose first ray looks
+straight back has each ray in the middle of a pixel, and none on the edge between two.
 
 The spherical projection of SqueezeSeg (Wu et al., ICRA 2018) over the whole circle. Where several points fall into one
 pixel the nearest is kept: what is behind it is not in the way first.
@@ -14,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from sern_core.vocabulary.errors import BodyError, UsageError
 
 CHANNELS: Final = 5
-"""x, y, z, intensity and range, as the network takes them."""
+"""x, y, z, intensity and range, as the network takes them. Intensity is in per cent, as the stand-in's."""
 MOST_POINTS: Final = 1_000_000
 NEAR_M: Final = 0.05
 FAR_M: Final = 200.0
@@ -78,7 +80,7 @@ def project(cloud: ArrayLike, shape: ImageShape = VLP16) -> RangeImage:
     ring = (shape.high_rad - shape.low_rad) / (shape.rows - 1)
     rows = np.rint((shape.high_rad - np.arctan2(z_m, flat_m)) / ring).astype(np.int32)
     on_rings = within & (rows >= 0) & (rows < shape.rows)
-    columns = ((0.5 - np.arctan2(y_m, x_m) / math.tau) * shape.columns).astype(np.int32) % shape.columns
+    columns = np.rint((0.5 - np.arctan2(y_m, x_m) / math.tau) * shape.columns).astype(np.int32) % shape.columns
     order = np.flatnonzero(on_rings)
     order = order[np.argsort(-ranges_m[order], kind="stable")]  # the nearest is written last
     numbers = np.full((shape.rows, shape.columns), -1, np.int32)

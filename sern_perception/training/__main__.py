@@ -1,14 +1,14 @@
 """`python -m sern_perception.training`: make the network that comes with SERN, or study what adaptations are worth."""
 
 import argparse
-import json
 import sys
 import time
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 
-from sern_core.vocabulary.errors import SernError
+from sern_core.vocabulary.errors import ConfigError, SernError
 from sern_perception.segmenter import WEIGHTS
+from sern_perception.training.table import Study, joined, read, table
 
 TRAINING_SCANS = 1600
 TEST_SCANS = 160
@@ -17,7 +17,9 @@ TEST_SCANS = 160
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m sern_perception.training", description=__doc__)
     parser.add_argument("what", choices=["train", "study"])
-    parser.add_argument("--out", type=Path, help="the model, or the JSON of the study")
+    parser.add_argument("--out", type=Path, help="the model, or the JSON of the study, which goes on where it was")
+    parser.add_argument("--table", type=Path, nargs="+", help="of studies: print the table of these, and try nothing")
+    parser.add_argument("--commit", default="unknown", help="of the code, for the study's table")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--seeds", type=int, default=5, help="of the study")
     parser.add_argument("--steps", type=int, help="of each training")
@@ -25,6 +27,9 @@ def main() -> int:
     parser.add_argument("--threads", type=int, default=2)
     options = parser.parse_args()
     try:
+        if options.table is not None:
+            print(table(joined([read(path) for path in options.table])))
+            return 0
         return study(options) if options.what == "study" else make_model(options)
     except SernError as error:
         sys.exit(f"sern_perception.training: {error}")
@@ -51,20 +56,27 @@ def make_model(options: argparse.Namespace) -> int:
 
 
 def study(options: argparse.Namespace) -> int:
-    from sern_perception.training.learning import Budget
-    from sern_perception.training.study import interval, tried
+    """Seed by seed. Seeds that are in the file are not done again."""
+    from sern_perception.training.study import BUDGET, NAMES, tried
 
-    budget = Budget(steps=options.steps or 500, batch=4, threads=options.threads)
-    found = []
+    budget = replace(BUDGET, steps=options.steps or BUDGET.steps, threads=options.threads)
+    head = {"steps": budget.steps, "batch": budget.batch, "columns": budget.columns}
+    found = Study(options.commit, head, [])
+    if options.out is not None and options.out.exists():
+        found = read(options.out)
+        if (found.commit, found.budget) != (options.commit, head):
+            raise ConfigError(f"{options.out} is of commit {found.commit} with {found.budget}: give another --out")
     for seed in range(options.seed, options.seed + options.seeds):
+        if {each.name for each in found.tried if each.seed == seed} == set(NAMES):
+            continue
+        rows = []
         for each in tried(seed, budget, lambda text: print(text, flush=True)):
-            found.append(each)
+            rows.append(each)
             print(f"seed {seed}, {each.name}: mIoU {each.miou:.3f}", flush=True)
-            if options.out is not None:
-                options.out.write_text(json.dumps([asdict(one) for one in found]) + "\n")
-    for name in dict.fromkeys(each.name for each in found):
-        mean, half = interval([each.miou for each in found if each.name == name])
-        print(f"{name}: mIoU {mean:.3f} ± {half:.3f}")
+        found = found._replace(tried=[*found.tried, *rows])
+        if options.out is not None:
+            options.out.write_text(found.as_json())
+    print(table(found))
     return 0
 
 

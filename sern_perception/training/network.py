@@ -14,9 +14,12 @@ from torch.nn import functional
 from sern_perception.classes import CLASSES
 from sern_perception.projection import CHANNELS
 
-SCALES: Final = (10.0, 10.0, 2.0, 1.0, 15.0)
+SCALES: Final = (10.0, 10.0, 2.0, 100.0, 15.0)
 """What x, y, z, intensity and range are divided by, so that all are about 1."""
 WIDTHS: Final = (32, 48, 64, 96)
+INTENSITY_BINS: Final = 20
+"""Equal parts of 0 to 100 %."""
+NEIGHBOURS: Final = 4
 
 
 class Cam(nn.Module):  # type: ignore[misc]
@@ -88,20 +91,36 @@ class SegmentationNet(nn.Module):  # type: ignore[misc]
 
 class IntensityNet(nn.Module):  # type: ignore[misc]
     """Intensity of places: learned of clouds without labels, and rendered into those that have labels and no intensity
-    of a real scanner (SqueezeSegV2, "learned intensity rendering")."""
+    of a real scanner (SqueezeSegV2, "learned intensity rendering").
+
+    It says how likely each bin is, and where in it the intensity is. It looks at ranges and at what neighbours differ
+    by, not at where in the scanner's frame a place is: that is another one on another scanner.
+    """
 
     def __init__(self, width: int = 32) -> None:
         super().__init__()
-        self.register_buffer("scales", torch.tensor(SCALES).view(1, CHANNELS, 1, 1))
         self.net = nn.Sequential(
-            _conv(CHANNELS, width, 3), _conv(width, width, 3), _conv(width, width, 3), nn.Conv2d(width, 1, 1)
+            _conv(NEIGHBOURS * 2 + 2, width, 3),
+            _conv(width, width, 3),
+            _conv(width, width, 3),
+            nn.Conv2d(width, 2 * INTENSITY_BINS, 1),
         )
 
-    def forward(self, x: Tensor) -> Tensor:
-        """(n, 1, rows, columns) of the channels; that of intensity is not looked at."""
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Of channels (n, 5, rows, columns), without a look at intensity: scores of bins, and where in each bin the
+        intensity is, from -0.5 to 0.5; (n, bins, rows, columns) both."""
         there = (x[:, 4:5] > 0).to(x.dtype)
-        scaled = x / self.scales
-        return self.net(torch.cat([scaled[:, :3], scaled[:, 4:5], there], 1)) * there
+        ranges_m, heights_m = x[:, 4:5], x[:, 2:3]
+        padded = functional.pad(torch.cat([ranges_m, heights_m, there], 1), (1, 1, 1, 1))
+        rows, columns = x.shape[-2:]
+        parts = [ranges_m / SCALES[4], there]
+        for down, right in ((0, 1), (2, 1), (1, 0), (1, 2)):
+            beside = padded[:, :, down : down + rows, right : right + columns]
+            both = beside[:, 2:3] * there
+            by = (beside[:, :2] - torch.cat([ranges_m, heights_m], 1)) / ranges_m.clamp(min=0.5)
+            parts.append((10 * by).clamp(-2.0, 2.0) * both)
+        scores, within = self.net(torch.cat(parts, 1)).chunk(2, 1)
+        return scores, torch.tanh(within) / 2
 
 
 def _conv(before: int, after: int, size: int, *, stride: Any = 1) -> nn.Sequential:

@@ -5,6 +5,7 @@ rings, mounted higher and askew, noisier, with points missing, and an intensity 
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from random import Random
 from typing import Final, NamedTuple
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sern_perception.projection import ImageShape, project
+from sern_perception.training.shapes import Shape, drawn
 from sern_sim.mujoco_jackal import MujocoJackal
 from sern_sim.robot import LIDAR_HEIGHT_M, LIDAR_RANGE_M, Pose2
 from sern_sim.terrain import Block, Label, Terrain
@@ -20,6 +22,12 @@ from sern_sim.terrain import Block, Label, Terrain
 FREE_M: Final = 0.7
 """A scanner is set down no nearer to anything."""
 REFLECTS: Final = {Label.GROUND: 0.25, Label.CAR: 0.8, Label.BRIDGE: 0.5, Label.LOG: 0.35, Label.OTHER: 0.6}
+INTENSITY_NOISE_PERCENT: Final = 3.0
+FIRST_THING: Final = 100
+APART_M: Final = 2.5
+"""Things of other shapes stand no nearer to each other."""
+ABOVE_M: Final = 4.0
+"""Ground is looked for from so high."""
 Floats = NDArray[np.float32]
 
 
@@ -100,25 +108,51 @@ def places(random: Random, world: Terrain, count: int) -> list[Pose2]:
     raise ValueError(f"a world in which {len(found)} of {count} places are free")
 
 
-def cloud(jackal: MujocoJackal, sensor: Sensor, noise: np.random.Generator) -> Floats:
-    """(rows * columns, 5): x, y, z in the sensor's frame, intensity and label; NaN where no return came."""
+def cloud(jackal: MujocoJackal, sensor: Sensor, noise: np.random.Generator, things: Sequence[Shape] = ()) -> Floats:
+    """(rows * columns, 5): x, y, z in the sensor's frame [m], intensity [%] and label; NaN where no return came. The
+    first of `things` has the label `FIRST_THING`, and so on."""
     elevations = np.linspace(sensor.high_rad, sensor.low_rad, sensor.rows)[:, None]
-    bearings = math.pi - (np.arange(sensor.columns) + 0.5) / sensor.columns * math.tau
+    bearings = math.pi - np.arange(sensor.columns) / sensor.columns * math.tau
     rays = np.empty((sensor.rows, sensor.columns, 3))
     rays[..., 0] = np.cos(elevations) * np.cos(bearings)
     rays[..., 1] = np.cos(elevations) * np.sin(bearings)
     rays[..., 2] = np.sin(elevations)
     cos, sin = math.cos(sensor.pitch_rad), math.sin(sensor.pitch_rad)
     pitched = rays.reshape(-1, 3) @ np.array([(cos, 0.0, -sin), (0.0, 1.0, 0.0), (sin, 0.0, cos)])
-    ranges_m, labels = jackal.cast((0.0, 0.0, sensor.height_m), pitched)
+    at_m = (0.0, 0.0, sensor.height_m)
+    ranges_m, labels = jackal.cast(at_m, pitched)
+    for number, thing in enumerate(things):
+        met_m = thing.meets(np.array(at_m), pitched)
+        labels = np.where(met_m < ranges_m, FIRST_THING + number, labels).astype(np.uint16)
+        ranges_m = np.minimum(ranges_m, met_m)
     there = ranges_m <= LIDAR_RANGE_M
     near, far = sensor.lost
     there &= noise.random(len(ranges_m)) >= near + (far - near) * np.minimum(ranges_m / LIDAR_RANGE_M, 1.0) ** 2
     measured_m = np.where(there, ranges_m + noise.normal(0.0, sensor.noise_m, len(ranges_m)), np.nan)
     found = np.empty((len(ranges_m), 5), np.float32)
     found[:, :3] = rays.reshape(-1, 3) * measured_m[:, None]
-    found[:, 3] = _intensity(sensor, found[:, :3], labels, noise)
+    found[:, 3] = _intensity(sensor, found[:, :3], np.minimum(labels, Label.OTHER), noise)
     found[:, 4] = np.where(there, labels, Label.NOTHING)
+    return found
+
+
+def things_around(
+    jackal: MujocoJackal, random: Random, count: int, *, near_m: float = 1.2, far_m: float = 6.0
+) -> list[Shape]:
+    """Shapes that no training scan has, around a robot, on the ground and in sight; fewer where it is crowded."""
+    found: list[Shape] = []
+    for _ in range(20 * count):
+        bearing_rad, away_m = random.uniform(-math.pi, math.pi), random.uniform(near_m, far_m)
+        x_m, y_m = away_m * math.cos(bearing_rad), away_m * math.sin(bearing_rad)
+        if any(math.hypot(x_m - each.middle_m[0], y_m - each.middle_m[1]) < APART_M for each in found):
+            continue
+        around = [(x_m + right, y_m + up) for right in (-0.7, 0.0, 0.7) for up in (-0.7, 0.0, 0.7)]
+        below = [jackal.cast((*place, ABOVE_M), np.array([(0.0, 0.0, -1.0)])) for place in around]
+        if all(labels[0] == Label.GROUND for _, labels in below):
+            ground_m = ABOVE_M - float(below[len(below) // 2][0][0])
+            found.append(drawn(random, x_m, y_m, ground_m))
+            if len(found) == count:
+                break
     return found
 
 
@@ -127,7 +161,7 @@ def _intensity(
 ) -> NDArray[np.float64]:
     ranges_m = np.linalg.norm(points_m, axis=1)
     if not sensor.reflects:
-        plain: NDArray[np.float64] = np.nan_to_num(1.0 / (1.0 + ranges_m))
+        plain: NDArray[np.float64] = np.nan_to_num(100.0 / (1.0 + ranges_m))
         return plain
     reflects = np.zeros(int(max(Label)) + 1)
     for label, share in REFLECTS.items():
@@ -136,8 +170,9 @@ def _intensity(
     across, up = np.roll(image, -1, axis=1) - image, np.roll(image, -1, axis=0) - image
     normals = np.cross(across, up).reshape(-1, 3)
     facing = np.abs((normals * points_m).sum(axis=1)) / (np.linalg.norm(normals, axis=1) * ranges_m + 1e-9)
-    said = reflects[labels] * (0.2 + 0.8 * np.nan_to_num(facing, nan=0.5)) * np.exp(-ranges_m / 40.0)
-    found: NDArray[np.float64] = np.nan_to_num(np.clip(said + noise.normal(0.0, 0.03, len(said)), 0.0, 1.0))
+    said = 100.0 * reflects[labels] * (0.2 + 0.8 * np.nan_to_num(facing, nan=0.5)) * np.exp(-ranges_m / 40.0)
+    noisy = said + noise.normal(0.0, INTENSITY_NOISE_PERCENT, len(said))
+    found: NDArray[np.float64] = np.nan_to_num(np.clip(noisy, 0.0, 100.0))
     return found
 
 

@@ -34,9 +34,12 @@ def box(x_m: float, y_m: float, wide_m: float, tall_m: float, deep_m: float = 0.
     return meets
 
 
-def seen(*things: Meets, noise_m: float = 0.0, slope: float = 0.0, far_m: float = 30.0) -> RangeImage:
+def seen(
+    *things: Meets, noise_m: float = 0.0, slope: float = 0.0, far_m: float = 30.0, off: float = 0.0, lost: float = 0.0
+) -> RangeImage:
+    """`off`: how far the rays are from the middles of the columns, in steps. `lost`: the share of missing points."""
     elevations = np.linspace(VLP16.high_rad, VLP16.low_rad, VLP16.rows)[:, None]
-    bearings = math.pi - (np.arange(VLP16.columns) + 0.5) / VLP16.columns * math.tau
+    bearings = math.pi - (np.arange(VLP16.columns) + off) / VLP16.columns * math.tau
     rays = np.stack(
         np.broadcast_arrays(
             np.cos(elevations) * np.cos(bearings), np.cos(elevations) * np.sin(bearings), np.sin(elevations)
@@ -45,7 +48,9 @@ def seen(*things: Meets, noise_m: float = 0.0, slope: float = 0.0, far_m: float 
     ).reshape(-1, 3)
     ranges_m = np.minimum.reduce([ground(rays, slope), *(thing(rays) for thing in things)])
     ranges_m = np.where(ranges_m <= far_m, ranges_m, np.nan)
-    ranges_m = ranges_m + np.random.default_rng(1).normal(0.0, noise_m, len(ranges_m))
+    draw = np.random.default_rng(1)
+    ranges_m = ranges_m + draw.normal(0.0, noise_m, len(ranges_m))
+    ranges_m = np.where(draw.random(len(ranges_m)) < lost, np.nan, ranges_m)
     return project((rays * ranges_m[:, None]).astype(np.float32))
 
 
@@ -72,6 +77,15 @@ def test_what_stands_on_the_ground_is_found_where_it_is(x_m: float, wide_m: floa
     assert thing.size_m[1] == pytest.approx(wide_m, abs=0.15)
     assert ABOVE_M < thing.above_m <= tall_m + 0.05
     assert standing(image, VLP16).sum() == len(thing.pixels)
+
+
+@pytest.mark.parametrize(("off", "lost"), [(0.5, 0.0), (0.0, 0.1)])
+def test_a_scanner_that_is_out_of_step_or_loses_points_sees_one_thing_as_one(off: float, lost: float) -> None:
+    """Half a step off, rounding puts two rays into one pixel and none into the next."""
+    image = seen(box(2.0, 0.5, 0.8, 0.6), noise_m=0.01, off=off, lost=lost)
+    assert not image.seen[-1].all()
+    (thing,) = clusters(image, VLP16)
+    assert thing.size_m[1] == pytest.approx(0.8, abs=0.15)
 
 
 def test_two_things_beside_each_other_are_two_and_one_behind_another_is_its_own() -> None:

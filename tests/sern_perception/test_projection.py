@@ -20,21 +20,30 @@ def at(bearing_rad: float, elevation_rad: float, range_m: float, intensity: floa
 
 
 @pytest.mark.parametrize("shape", [VLP16, HDL64], ids=["16x900", "64x512"])
-def test_rows_fall_and_columns_go_from_left_over_ahead_to_right(shape: ImageShape) -> None:
+def test_rows_fall_and_columns_go_from_behind_over_left_and_ahead_to_right(shape: ImageShape) -> None:
     ring_rad = (shape.high_rad - shape.low_rad) / (shape.rows - 1)
     cloud = [
-        at(1e-3, shape.high_rad, 5.0),
+        at(0.0, shape.high_rad, 5.0),
         at(math.pi / 2, shape.low_rad, 6.0),
         at(-math.pi / 2, shape.high_rad - 3 * ring_rad, 7.0, intensity=0.25),
     ]
     image = project(cloud, shape)
-    ahead, left, right = ((number % shape.columns) for number in (shape.columns // 2 - 1, shape.columns // 4, 0))
+    ahead, left = shape.columns // 2, shape.columns // 4
     assert image.points[0, ahead] == 0
     assert image.points[-1, left] == 1 and image.points[-1].tolist().count(-1) == shape.columns - 1
     rows, columns = np.nonzero(image.points == 2)
-    assert rows.tolist() == [3] and columns[0] == 3 * shape.columns // 4 and right == 0
+    assert rows.tolist() == [3] and columns[0] == 3 * shape.columns // 4
     assert image.channels[:, 3, columns[0]] == pytest.approx([*cloud[2][:3], 0.25, 7.0], abs=1e-5)
     assert image.seen.sum() == 3 and not image.channels[:, ~image.seen].any()
+
+
+@pytest.mark.parametrize("off", [-0.4, 0.0, 0.4])
+def test_each_ray_of_a_scanner_that_is_as_fine_as_the_columns_has_a_pixel(off: float) -> None:
+    """The first ray of the stand-in's looks straight back; that of another one may be off by less than half a step."""
+    bearings = -math.pi + (np.arange(VLP16.columns) + off) / VLP16.columns * math.tau
+    cloud = np.array([at(float(bearing), VLP16.low_rad, 3.7) for bearing in bearings], np.float32)
+    image = project(cloud)
+    assert image.seen[-1].all() and not any(image.unused.values())
 
 
 def test_the_nearest_point_of_a_pixel_is_kept_whatever_their_order() -> None:

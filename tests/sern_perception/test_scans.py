@@ -10,7 +10,19 @@ from sern_sim.terrain import Label
 
 pytest.importorskip("mujoco", reason="needs mujoco: pip install 'sern[sim]'")
 
-from sern_perception.training.scans import FREE_M, SHIFTED, SOURCE, make, places, scattered
+from sern_perception.training.scans import (
+    APART_M,
+    FIRST_THING,
+    FREE_M,
+    SHIFTED,
+    SOURCE,
+    cloud,
+    make,
+    places,
+    scattered,
+    things_around,
+)
+from sern_sim.mujoco_jackal import MujocoJackal
 
 
 def test_classes_are_the_labels_of_the_stand_in() -> None:
@@ -56,3 +68,23 @@ def test_places_are_free() -> None:
         for block in world.blocks:
             if block.label in (Label.CAR, Label.LOG):
                 assert np.hypot(place.x_m - block.x_m, place.y_m - block.y_m) > FREE_M * 0.9
+
+
+def test_other_things_stand_on_the_ground_apart_and_are_in_the_cloud_by_number() -> None:
+    random = Random(11)
+    jackal = MujocoJackal(random, world=scattered(random))
+    (place,) = places(random, jackal.world, 1)
+    jackal.stand(place)
+    things = things_around(jackal, random, 4)
+    assert len(things) == 4
+    said = cloud(jackal, SOURCE, np.random.default_rng(1), things)
+    plain = cloud(jackal, SOURCE, np.random.default_rng(1))
+    for number, thing in enumerate(things):
+        points = said[said[:, 4] == FIRST_THING + number, :3].astype(float)
+        assert len(points)
+        away = np.linalg.norm(points - np.array(thing.middle_m) + np.array([0.0, 0.0, SOURCE.height_m]), axis=1)
+        assert away.max() < np.linalg.norm(thing.half_m) + 0.1
+        others = [each for each in things if each is not thing]
+        assert all(np.hypot(*np.subtract(thing.middle_m, each.middle_m)[:2]) >= APART_M for each in others)
+    elsewhere = said[:, 4] < FIRST_THING
+    assert np.array_equal(said[elsewhere], plain[elsewhere], equal_nan=True)
