@@ -12,7 +12,7 @@ import asyncio
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final
 
@@ -58,6 +58,9 @@ WHOLE_S: Final = 5.0
 """How often the whole map is published at most: to who comes late, the last one is latched."""
 MOST_UPDATES: Final = 64
 """Where more blocks change at once, the whole map is published."""
+REPEAT_S: Final = 1.0
+"""Where nothing changes, one block is published over again so often: who missed an update has it in the end, and who
+navigates by the map knows that it is one of now."""
 DISCREPANCIES_S: Final = 0.5
 """How often discrepancies are published at most."""
 OFFSETS_S: Final = 1.0
@@ -121,8 +124,10 @@ class SceneNode:
         self._changed_s: NDArray[np.float64] = np.full(grid.blocks, np.nan)
         self.changes = 0
         """How often any block has changed: while it is the same, so are the cells."""
-        self._whole_due_s = now()
+        self._whole_due_s = self._repeat_due_s = now()
         self._whole = True
+        self._repeated = -1
+        """The block that was published over again last."""
         self._offsets_due_s = now()
         self._said = SayOnce(_log)
         self.differing = SceneDiscrepancies(
@@ -318,18 +323,27 @@ class SceneNode:
 
     def _publish(self, now: float) -> None:
         if not self._changed and not (self._whole and now >= self._whole_due_s):
+            if now < self._repeat_due_s or TopicName(self.options.publish) not in self._publishers:
+                return
+            self._repeated = (self._repeated + 1) % self.grid.blocks
+            self._say_blocks([self._repeated], now)
             return
         cells, stamp_ns = self.cells(), self._wall_ns()
         due = self._whole and now >= self._whole_due_s
         if due or len(self._changed) > MOST_UPDATES:
-            self._whole, self._whole_due_s = False, now + WHOLE_S
+            self._whole, self._whole_due_s, self._repeat_due_s = False, now + WHOLE_S, now + REPEAT_S
             self._say(self.options.publish, bodies.GRID, self._writer.whole(cells, stamp_ns=stamp_ns), stamp_ns)
         else:
             self._whole = True
-            for block in sorted(self._changed):
-                update = self._writer.update(cells, block, stamp_ns=stamp_ns)
-                self._say(f"{self.options.publish}_updates", bodies.UPDATE, update, stamp_ns)
+            self._say_blocks(sorted(self._changed), now)
         self._changed.clear()
+
+    def _say_blocks(self, blocks: Sequence[int], now: float) -> None:
+        self._repeat_due_s = now + REPEAT_S
+        cells, stamp_ns = self.cells(), self._wall_ns()
+        for block in blocks:
+            update = self._writer.update(cells, block, stamp_ns=stamp_ns)
+            self._say(f"{self.options.publish}_updates", bodies.UPDATE, update, stamp_ns)
 
     def _publish_discrepancies(self, now: float) -> None:
         if self.differing.changes == self._differing_changes or now < self._differing_due_s:
