@@ -7,6 +7,7 @@ import typer
 from sern_runtime import version
 from sern_tools import check, keygen
 from sern_tools.demo import demo
+from sern_tools.demo_navigation import demo_navigation
 from sern_tools.demo_twin import demo_twin
 from sern_tools.echo import echo
 from sern_tools.explain import explain
@@ -34,6 +35,7 @@ def _options(
 
 app.command()(demo)
 app.command("demo-twin")(demo_twin)
+app.command("demo-navigation")(demo_navigation)
 app.add_typer(keygen.app, name="keygen")
 app.add_typer(lab_app, name="lab")
 app.command("check")(check.check_command)

@@ -349,6 +349,7 @@ class NavigationNode:
         if not isinstance(found, ObstacleScan):
             return moved  # the navigator counts why, and says so
         self._problem = ""
+        self._say(self.options.topics.scan, writing.SCAN, self._writer.scan(found, stamp_ns=wall_ns), wall_ns)
         if self._own_map is not None and pose is not None:
             self._scan = wall_ns, pose, found
         return found

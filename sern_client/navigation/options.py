@@ -41,6 +41,7 @@ class TopicNames:
     plan: str = "/plan"
     trajectory: str = "/optimal_trajectory"
     costmap: str = "/local_costmap/costmap"
+    scan: str = "/obstacle_scan"
     own_map: str = "/map"
     status: str = "/navigation/status"
     action: str = "/navigate_to_pose"

@@ -9,6 +9,7 @@ import numpy as np
 from sern_core.vocabulary.types import Encoding
 from sern_navigation.collision_monitor import Speed
 from sern_navigation.costmap.costs import Costmap
+from sern_navigation.scan import ObstacleScan
 from sern_runtime import ros_types
 from sern_twin.world.grid import Floats
 from sern_twin.world.occupancy import Pose
@@ -20,6 +21,9 @@ GRID: Final = "nav_msgs/msg/OccupancyGrid"
 DIAGNOSTICS: Final = "diagnostic_msgs/msg/DiagnosticArray"
 TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"
 POSE: Final = "geometry_msgs/msg/PoseStamped"
+SCAN: Final = "sensor_msgs/msg/LaserScan"
+SCAN_M: Final = 6.0
+"""How far it goes: further away the ground is seen in few places."""
 _TRANSLATED: Final = np.concatenate(
     ([0], 1 + 97 * np.arange(252) // 251, [99, 100, -1])
 ).astype(np.int8)  # fmt: skip
@@ -59,6 +63,24 @@ class Writer:
     def stamped_pose(self, pose: Pose, *, stamp_ns: int) -> Any:
         """A PoseStamped, as a part of other messages."""
         return self._new(POSE, header=self._header(stamp_ns, self._frame_id), pose=self._pose(pose))
+
+    def scan(self, scan: ObstacleScan, *, stamp_ns: int) -> bytes:
+        """S_2D as a sensor_msgs/LaserScan of the robot's own frame, whose middle is that of the scanner."""
+        near = scan.ranges_m <= SCAN_M
+        open_to_there = scan.ground_m[:, 1] >= SCAN_M
+        ranges = np.where(near, scan.ranges_m, np.where(open_to_there, np.inf, np.nan))
+        step_rad = 2 * math.pi / len(ranges)
+        return self._body(
+            SCAN,
+            header=self._header(stamp_ns, self._base_frame),
+            angle_min=float(scan.bearings_rad[0]),
+            angle_max=float(scan.bearings_rad[-1]),
+            angle_increment=step_rad,
+            range_min=0.05,
+            range_max=SCAN_M,
+            ranges=ranges.astype(np.float32),
+            intensities=np.empty(0, np.float32),
+        )
 
     def costmap(self, costmap: Costmap, *, stamp_ns: int) -> bytes:
         """A nav_msgs/OccupancyGrid, as Nav2 publishes its costmaps; what the twin adds is in it."""

@@ -391,6 +391,7 @@ class SceneNode:
             "cell_m": self.grid.cell_m,
             "occupied_cells": int((cells >= OCCUPIED).sum()),
             "known_cells": int((cells != UNKNOWN).sum()),
+            "added_cells": int((self.scene.merged("twin_only") != UNKNOWN).sum()),
             "cleared_cells": int((self.scene.merged("live") == CLEARED).sum()),
             "blocks": len(self.scene.versions()),
             "digests": {layer: self.scene.digest(layer) for layer in LAYERS},

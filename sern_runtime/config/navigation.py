@@ -104,6 +104,9 @@ class NavigationTopics(Section):
     """What the controller is about to drive: nav_msgs/Path."""
     costmap: TopicText = "/local_costmap/costmap"
     """Costs around the robot, twice a second: nav_msgs/OccupancyGrid."""
+    scan: TopicText = "/obstacle_scan"
+    """What of each cloud stands in the way, edges of the ground among it: sensor_msgs/LaserScan. It is infinite where
+    the ground was seen to be free, and NaN where nothing was seen; a scene takes it as a scanner of its robot."""
     own_map: TopicText = "/map"
     """With `localisation: scans`: its map, nav_msgs/OccupancyGrid, and under NAME_updates what changes."""
     status: TopicText = "/navigation/status"

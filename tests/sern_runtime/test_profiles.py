@@ -19,7 +19,7 @@ from tests.sern_sim.toys import ArqReceiver, ArqSender
 
 NAMES = [
     "lan", "wifi", "field-wifi", "lte", "satcom", "mesh-radio", "step", "blackout-10", "blackout-30", "flap",
-    "burst-loss", "demo", "demo-twin",
+    "burst-loss", "demo", "demo-navigation", "demo-twin",
 ]  # fmt: skip
 
 
