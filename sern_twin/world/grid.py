@@ -34,7 +34,8 @@ class Grid:
     """A rectangle of square cells in the plane of a site. Its south-west corner lies at `west_m`, `south_m`.
 
     `plane` says where that is on the Earth, where it is known; `frame_id` is the ROS frame of its east and north. Two
-    grids that are equal have the same `grid_id`. Blocks are squares of `block_cells` cells, cut at the north and east.
+    grids that are equal but for the plane have the same `grid_id`. Blocks are squares of `block_cells` cells, cut at
+    the north and east.
 
     UsageError: a size that is none, or more than `MOST_CELLS`, `MOST_SIDE` or `MOST_BLOCKS`.
     """
@@ -98,12 +99,10 @@ class Grid:
 
     @cached_property
     def grid_id(self) -> str:
-        """16 hexadecimal digits that are the same wherever all of the above is: a patch says which grid it is for."""
+        """16 hexadecimal digits that are the same wherever all of the above is but `plane`: a patch says which grid it is
+        for. Where the frame is on the Earth a site with a map knows, and a robot need not."""
         words = [self.frame_id]
         places = [self.west_m, self.south_m, self.cell_m]
-        if self.plane is not None:
-            words.append(self.plane.model)
-            places += [self.plane.latitude_rad, self.plane.longitude_rad, self.plane.height_m]
         numbers = struct.pack("<3I", self.columns, self.rows, self.block_cells)
         told = struct.pack(f"<{len(places)}d", *(place + 0.0 for place in places))  # -0.0 is 0.0
         return sha256(numbers + told + "\0".join(words).encode("utf-8", "surrogatepass")).hexdigest()[: 2 * _ID_BYTES]
