@@ -186,7 +186,6 @@ def node_options(model: NavigationFile) -> NodeOptions:
 
 
 def _named(section: EndpointSection) -> EndpointSection:
-    """The section with the name of the node, where the file gives none."""
-    if "node_name" in section.model_fields_set:
-        return section
-    return section.model_copy(update={"node_name": NODE_NAME})
+    """The section with the name of the node, where the file gives none. A node hears what SERN's clients publish."""
+    name = {} if "node_name" in section.model_fields_set else {"node_name": NODE_NAME}
+    return section.model_copy(update={"accept_bridged": True, **name})
