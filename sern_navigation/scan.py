@@ -182,20 +182,22 @@ def obstacle_scan(cloud: Cloud, options: ScanOptions) -> ObstacleScan | Refused:
     points = _columns(cloud.points_m)
     if isinstance(points, Refused):
         return points
-    finite = np.isfinite(points).all(axis=1)
-    if not finite.any() or not math.isfinite(cloud.stamp_s):
-        return Refused(Unusable.NOT_FINITE, f"a cloud of {len(points)} points, none of them finite, or without a time")
-    points = points[finite] - np.array(options.origin_m, np.float32)
+    x, y = points[0] - np.float32(options.origin_m[0]), points[1] - np.float32(options.origin_m[1])
+    z = points[2] - np.float32(options.origin_m[2])
     with np.errstate(over="ignore"):
-        ranges_m = np.sqrt(points[:, 0] * points[:, 0] + points[:, 1] * points[:, 1])
-    used = (ranges_m >= options.range_min_m) & (ranges_m <= _MOST_M) & (np.abs(points[:, 2]) <= _MOST_M)
-    if np.count_nonzero(used) < options.min_points:
+        ranges_m = np.sqrt(x * x + y * y)
+    # What is not finite is not so near either.
+    used = np.flatnonzero((ranges_m >= options.range_min_m) & (ranges_m <= _MOST_M) & (np.abs(z) <= _MOST_M))
+    if not math.isfinite(cloud.stamp_s) or not (len(used) or np.isfinite(points).all(axis=0).any()):
+        return Refused(Unusable.NOT_FINITE, f"a cloud of {len(x)} points, none of them finite, or without a time")
+    if len(used) < options.min_points:
         return Refused(
             Unusable.TOO_FEW,
-            f"a cloud of {np.count_nonzero(used)} points of the surroundings: {options.min_points} are the least; "
+            f"a cloud of {len(used)} points of the surroundings: {options.min_points} are the least; "
             "see whether the scanner is covered",
         )
-    return _Reading(points[used], ranges_m[used], _level(cloud, options), options).scan(cloud.stamp_s)
+    places = x[used], y[used], z[used]
+    return _Reading(places, ranges_m[used], _level(cloud, options), options).scan(cloud.stamp_s)
 
 
 def planar_scan(
@@ -232,6 +234,7 @@ def planar_scan(
 
 
 def _columns(points: NDArray[Any]) -> NDArray[np.float32] | Refused:
+    """The coordinates of a cloud, (3, n): a row each, since most of what is done with them goes along one."""
     if points.dtype.names is not None:
         missing = [name for name in ("x", "y", "z") if name not in points.dtype.names]
         if missing:
@@ -247,7 +250,7 @@ def _columns(points: NDArray[Any]) -> NDArray[np.float32] | Refused:
     if len(points) > MOST_POINTS:
         return Refused(Unusable.TOO_LARGE, f"a cloud of {len(points)} points: {MOST_POINTS} are the most")
     with np.errstate(over="ignore"):  # beyond float32 is infinite, and that is not finite
-        return points[:, :3].astype(np.float32)
+        return np.ascontiguousarray(points[:, :3].T, np.float32)
 
 
 def _level(cloud: Cloud, options: ScanOptions) -> NDArray[np.float32]:
@@ -261,16 +264,20 @@ def _level(cloud: Cloud, options: ScanOptions) -> NDArray[np.float32]:
 
 
 def _sectors(bearings_rad: NDArray[np.floating[Any]], sectors: int) -> Indices:
-    found: Indices = np.floor((bearings_rad + math.pi) * (sectors / _TURN)).astype(np.intp) % sectors
+    turns = (bearings_rad + math.pi) * (sectors / _TURN)
+    found: Indices = np.floor(turns, out=turns).astype(np.intp)
+    beyond = (found < 0) | (found >= sectors)
+    if beyond.any():  # few are, and whole numbers are slow to divide
+        found[beyond] %= sectors
     return found
 
 
 class _Reading:
-    """One cloud, (n, 3) from the scanner on: its walks outwards, all bearings at once."""
+    """One cloud, x, y and z (n,) from the scanner on: its walks outwards, all bearings at once."""
 
     def __init__(
         self,
-        points: NDArray[np.float32],
+        places: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
         ranges_m: NDArray[np.float32],
         level: NDArray[np.float32],
         options: ScanOptions,
@@ -281,26 +288,27 @@ class _Reading:
         self._bins_m = bin_edges_m(options.range_max_m)
         self._shape = len(self._bins_m) - 1, options.sectors
         self._r = ranges_m
-        self._x, self._y, self._z = points[:, 0], points[:, 1], points[:, 2] + np.float32(self._height_m)
+        self._x, self._y, self._z = places[0], places[1], places[2] + np.float32(self._height_m)
         self._sector = _sectors(np.arctan2(self._y, self._x), options.sectors)
         fine = np.arange(math.ceil(options.range_max_m / _FINE_M) + 1) * _FINE_M + 1e-6
         table = np.searchsorted(self._bins_m[1:-1], fine, side="right")
-        near = self._r < options.range_max_m
-        self._bin = table[np.where(near, self._r / np.float32(_FINE_M), 0).astype(np.intp)]
-        self._near = near
+        self._near = np.flatnonzero(self._r < options.range_max_m)
+        number = table[(self._r[self._near] / np.float32(_FINE_M)).astype(np.intp)]
+        self._key = number * options.sectors + self._sector[self._near]
 
     def scan(self, stamp_s: float) -> ObstacleScan:
-        options, near = self._options, self._near
-        r, z, sector = self._r[near], self._z[near], self._sector[near]
-        key = self._bin[near] * options.sectors + sector
+        options, near, key = self._options, self._near, self._key
+        r, z = self._r[near], self._z[near]
         ground = self._walk(r, z, key)
         over = z - (ground.z_m.reshape(-1)[key] + ground.slope.reshape(-1)[key] * (r - ground.r_m.reshape(-1)[key]))
-        obstacle = (over >= options.min_obstacle_height) & (over <= options.max_obstacle_height)
-        ranges_m = np.full(options.sectors, np.inf)
-        np.minimum.at(ranges_m, sector[obstacle], r[obstacle].astype(np.float64))
+        obstacle = np.flatnonzero((over >= options.min_obstacle_height) & (over <= options.max_obstacle_height))
+        which = near[obstacle]
+        nearest = np.full(options.sectors, np.inf, np.float32)
+        np.minimum.at(nearest, self._sector[which], r[obstacle])
+        ranges_m = nearest.astype(np.float64)
         edges_m = np.minimum(ground.edges_m, self._missing(ground, ranges_m))
         edges_m[edges_m >= ranges_m] = np.inf
-        points_m, tops_m = self._marks(key[obstacle], over[obstacle], self._x[near][obstacle], self._y[near][obstacle])
+        points_m, tops_m = self._marks(key[obstacle], over[obstacle], self._x[which], self._y[which])
         at_edge = np.isfinite(edges_m)
         bearings = middles(options.sectors)[at_edge]
         edge_points = edges_m[at_edge, None] * np.stack((np.cos(bearings), np.sin(bearings)), axis=1)
@@ -323,7 +331,7 @@ class _Reading:
         options, cells = self._options, self._shape[0] * self._shape[1]
         low_z = np.full(cells, np.inf, np.float32)
         np.minimum.at(low_z, key, z)
-        lowest = z <= low_z[key]
+        lowest = np.flatnonzero(z <= low_z[key])
         low_r = np.zeros(cells, np.float32)
         low_r[key[lowest]] = r[lowest]
         stands = self._stands(low_z, low_r, r, z, key).reshape(self._shape)
@@ -334,33 +342,50 @@ class _Reading:
         )
         at_r, at_z, slope = (np.zeros(options.sectors, np.float32) for _ in range(3))
         ditch_m = np.full(options.sectors, np.inf)  # the edge of one, if what comes next is its other side
+        least_m, full_m, one = np.float32(1e-3), np.float32(0.2), np.float32(1)
+        step, sinks = np.float32(options.step_m), np.float32(-1.5 * options.step_m)
+        seen = np.isfinite(low_z)
+        anything = np.asarray(seen.any(axis=1))
+        low_z = np.where(seen, low_z, 0)
+        begun = False
         for number in range(self._shape[0]):
-            there = np.isfinite(low_z[number])
-            if there.any():
-                along = np.maximum(low_r[number] - at_r, np.float32(1e-3))
-                up = np.where(there, low_z[number] - at_z, 0)
-                tilt = up / along
+            if not anything[number]:
+                ground.z_m[number], ground.r_m[number], ground.slope[number] = at_z, at_r, slope
+                continue
+            there, r_m, z_m = seen[number], low_r[number], low_z[number]
+            along = np.maximum(r_m - at_r, least_m)
+            up = np.where(there, z_m - at_z, 0)
+            tilt = up / along
+            before = slope
+            if not begun:
                 # At first it goes on as the robot stands, or level, whichever is nearer to what is seen.
                 first = np.where(np.abs(tilt - self._level) < np.abs(tilt), self._level, 0)
                 before = np.where(at_r > 0, slope, first)
-                bend = tilt - before
-                too_steep = (up > options.step_m) & ((tilt > steepest) | (bend > rise))
-                sunk = bend * along < -1.5 * options.step_m
-                falls = sunk & ((tilt < -steepest) | ((bend < -fall) & (at_r <= options.drop_range_m)))
-                dips = sunk & (bend < -fall / 3) & (at_r <= options.drop_range_m)
+            bend = tilt - before
+            too_steep = (up > step) & ((tilt > steepest) | (bend > rise))
+            is_ground = there & ~(too_steep | stands[number])
+            sunk = bend * along < sinks
+            dips = None
+            if sunk.any():
+                close = at_r <= options.drop_range_m
+                falls = sunk & ((tilt < -steepest) | ((bend < -fall) & close))
+                dips = sunk & (bend < -fall / 3) & close
                 if dips.any() or falls.any():
-                    edges_m = self._edges_m(at_r, at_z, before, low_r[number], low_z[number])
+                    edges_m = self._edges_m(at_r, at_z, before, r_m, z_m)
                     ground.edges_m[falls] = np.minimum(ground.edges_m, edges_m)[falls]
                     ditch_m = np.where(dips, edges_m, ditch_m)
-                other_side = too_steep | (dips & stands[number])
+                    is_ground &= ~falls
+            if ditch_m.min() < np.inf:
+                other_side = too_steep if dips is None else too_steep | (dips & stands[number])
                 ground.edges_m = np.where(other_side, np.minimum(ground.edges_m, ditch_m), ground.edges_m)
-                is_ground = there & ~too_steep & ~falls & ~stands[number]
-                ditch_m[is_ground & ~dips] = np.inf
-                at_z = np.where(is_ground, low_z[number], at_z)
-                at_r = np.where(is_ground, low_r[number], at_r)
-                # Two points close to each other say little of a slope.
-                slope = np.where(is_ground, np.clip(tilt, -steepest, steepest) * np.minimum(along / 0.2, 1), slope)
-                ground.seen[number] = is_ground
+                ditch_m[is_ground if dips is None else is_ground & ~dips] = np.inf
+            np.copyto(at_z, z_m, where=is_ground)
+            np.copyto(at_r, r_m, where=is_ground)
+            # Two points close to each other say little of a slope.
+            limited = np.minimum(np.maximum(tilt, -steepest), steepest) * np.minimum(along / full_m, one)
+            np.copyto(slope, limited, where=is_ground)
+            begun = begun or bool(at_r.all())
+            ground.seen[number] = is_ground
             ground.z_m[number], ground.r_m[number], ground.slope[number] = at_z, at_r, slope
         return ground
 
@@ -409,18 +434,21 @@ class _Reading:
         rings = np.array(sorted(angle for angle in options.ring_elevations_rad if angle < 0))
         if len(rings) < 3:
             return edges_m
-        elevations = np.arctan2(self._z - self._height_m, self._r)
+        # Only rings that should meet it so near are asked about, and the one above them: few points are of those.
+        meeting = int(np.count_nonzero(self._height_m / np.tan(-rings) <= options.drop_range_m))
+        gap_rad = float(np.diff(rings).min())
+        highest = np.float32(math.tan(rings[min(meeting, len(rings) - 1)] + gap_rad))
+        low = np.flatnonzero(self._z - np.float32(self._height_m) < highest * self._r)
+        elevations = np.arctan2(self._z[low] - np.float32(self._height_m), self._r[low])
         ring = np.clip(np.searchsorted((rings[1:] + rings[:-1]) / 2, elevations), 0, len(rings) - 1)
-        close = np.abs(elevations - rings[ring]) < np.diff(rings).min() / 2
+        close = np.abs(elevations - rings[ring]) < gap_rad / 2
         there = np.zeros((len(rings), options.sectors), np.bool_)
-        there[ring[close], self._sector[close]] = True
+        there[ring[close], self._sector[low][close]] = True
         # A scanner with few bearings leaves some sectors out, by chance other ones in each ring.
         there |= np.roll(there, 1, axis=1) | np.roll(there, -1, axis=1)
         below = np.logical_and.accumulate(there, axis=0)
         last_m, z_m, slope = ground.r_m[-1], ground.z_m[-1], ground.slope[-1]
-        for number in range(1, len(rings) - 1):
-            if self._height_m / math.tan(-rings[number]) > options.drop_range_m:
-                break
+        for number in range(1, min(meeting, len(rings) - 1)):
             with np.errstate(divide="ignore", invalid="ignore"):
                 meets_m = (self._height_m - z_m + slope * last_m) / (slope + np.float32(math.tan(-rings[number])))
             gone = below[number - 1] & ~there[number] & ~there[number + 1]
@@ -451,7 +479,8 @@ class _Reading:
         """How low the lowest ray beyond each bin passes; one that ends on the ground shows all of it."""
         flattest = np.full(self._shape[0] * self._shape[1], np.inf, np.float32)
         inclination = (self._z - np.float32(self._height_m)) / self._r
-        at = np.where(self._near, self._bin, self._shape[0] - 1) * self._shape[1] + self._sector
+        at = (self._shape[0] - 1) * self._shape[1] + self._sector
+        at[self._near] = self._key
         np.minimum.at(flattest, at, inclination)
         beyond = np.minimum.accumulate(flattest.reshape(self._shape)[::-1], axis=0)[::-1]
         lowest = np.full(self._shape, np.inf, np.float32)
