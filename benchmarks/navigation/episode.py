@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.navigation.campus import GRID, Campus
 from sern_navigation.costmap.layered import CostmapOptions
 from sern_navigation.costmap.obstacles import ObstacleOptions
-from sern_navigation.costmap.twin import TwinView
+from sern_navigation.costmap.twin import TwinOptions, TwinView
 from sern_navigation.navigator import Goal, Navigator, NavigatorOptions, State
 from sern_navigation.scan import Cloud
 from sern_sim.robot import BODY_RADIUS_M, LIDAR_HEIGHT_M, STEP_S, Pose2, SimulatedJackal
@@ -50,6 +50,12 @@ class LinkProfile:
         into_s = now_s % self.every_s
         said_s = now_s if into_s >= self.gone_s else now_s - into_s
         return min(said_s, self.dies_s) - self.late_s
+
+    @property
+    def always_fresh(self) -> bool:
+        """Whether the twin never becomes stale: of a place that stands still it is then as good as at once."""
+        gap_s = self.gone_s + self.late_s
+        return gap_s <= TwinOptions().staleness_s and self.dies_s + TwinOptions().staleness_s >= MOST_S + self.late_s
 
 
 PROFILES: Final = (

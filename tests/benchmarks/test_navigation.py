@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.common import Report
+from benchmarks.navigation import episode
 from benchmarks.navigation.campus import GRID, cells_of
 from benchmarks.navigation.campus import campus as campus_of
 from benchmarks.navigation.drives import Drive, Drives, accuracies, links
@@ -94,7 +95,7 @@ def test_a_drive_that_several_tables_want_is_driven_once() -> None:
     links(4, report, drives)
     accuracies(4, report, drives)
     asked = [one for one in pool.driven if one.mode is Mode.SERN and one.accuracy == 0.9 and one.link is PROFILES[0]]
-    assert len(pool.driven) == len(set(pool.driven)) == 4 * (1 + 5 + 5) and len(asked) == 4
+    assert len(pool.driven) == len(set(pool.driven)) == 4 * (1 + 4 + 5) and len(asked) == 4
     rows = [row for row in report.rows if row.system == "100% right"]
     assert [row.metrics["success_percent"] for row in rows] == [50.0]
 
@@ -119,3 +120,11 @@ def test_a_file_that_has_other_lines_is_refused_by_its_line(tmp_path: Path) -> N
 def test_a_link_that_is_gone_for_good_brings_nothing_new() -> None:
     dies = LinkProfile("dies", 0.1, dies_s=20.0)
     assert [dies.stamp_s(now_s) for now_s in (5.0, 20.0, 99.0)] == pytest.approx([4.9, 19.9, 19.9])
+
+
+def test_a_link_that_is_late_and_never_stale_changes_no_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that its drives are those of the first profile."""
+    found, (first, late, *gone) = campus_of(3), PROFILES
+    assert late.always_fresh and not any(link.always_fresh for link in gone)
+    monkeypatch.setattr(episode, "MOST_S", 4.0)
+    assert episode.drive(3, found, Mode.SERN, link=first) == episode.drive(3, found, Mode.SERN, link=late)
