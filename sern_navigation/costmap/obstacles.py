@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sern_core.vocabulary.errors import UsageError
 from sern_navigation.costmap.costs import FREE_SPACE, LETHAL_OBSTACLE, NO_INFORMATION, Costs, Mask, Window, around
@@ -139,9 +140,10 @@ class ObstacleLayer:
             np.float32(np.inf),
         )
         marked, free = self._marked[window.slices], self._free[window.slices]
-        ground = scan.ground_m[sector]
+        ground = _on_all_sides(scan.ground_m)[sector]
         is_ground = (ranges >= ground[..., 0]) & (ranges <= ground[..., 1]) & np.isfinite(passed)
-        met = passed <= self._tops_m[window.slices] - np.float32(_CLEARLY_M)
+        through = np.where(np.isfinite(passed), _beside(scan.lowest_m)[number, sector], passed)
+        met = through <= self._tops_m[window.slices] - np.float32(_CLEARLY_M)
         met = np.where(self._edges[window.slices], is_ground, met)
         marked &= ~met
         self._edges[window.slices] &= marked
@@ -164,3 +166,20 @@ class ObstacleLayer:
         self._edges.reshape(-1)[cells[found_m == 0]] = True
         self._marked.reshape(-1)[cells] = True
         self._free.reshape(-1)[cells] = False
+
+
+def _beside(lowest_m: NDArray[np.float32]) -> NDArray[np.float32]:
+    """How low rays passed also beside each place and behind it, (bins, sectors).
+
+    A ray that grazes a wall passes through the near half of its cells. What a mark is cleared by is to pass on all
+    sides of it: else a robot that drives along a wall forgets it.
+    """
+    wide = np.maximum(lowest_m, np.maximum(np.roll(lowest_m, 1, axis=1), np.roll(lowest_m, -1, axis=1)))
+    wide[:-1] = np.maximum(wide[:-1], wide[1:])
+    return wide
+
+
+def _on_all_sides(ground_m: Floats) -> Floats:
+    """From where to where ground was seen at a bearing and at both beside it, (sectors, 2)."""
+    beside = np.stack((ground_m, np.roll(ground_m, 1, axis=0), np.roll(ground_m, -1, axis=0)))
+    return np.stack((beside[..., 0].max(axis=0), beside[..., 1].min(axis=0)), axis=1)

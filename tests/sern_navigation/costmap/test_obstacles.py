@@ -164,3 +164,23 @@ def test_clearing_forgets_all_and_scans_off_the_grid_do_no_harm() -> None:
 def test_ranges_that_are_none_are_refused(change: dict[str, float]) -> None:
     with pytest.raises(UsageError):
         ObstacleOptions(**change)  # type: ignore[arg-type]
+
+
+def test_a_wall_that_the_robot_drives_along_is_not_forgotten() -> None:
+    """Rays that graze it pass through the near half of its cells, whose middles they are before or behind."""
+
+    def past(robot_m: float) -> Heights:
+        def ground(x: Floats, y: Floats) -> Floats:
+            return np.where((np.abs(x + robot_m) < 2.0) & (y > 1.03) & (y < 1.5), 1.4, 0.0)
+
+        return ground
+
+    layer = ObstacleLayer(GRID)
+    noise = np.random.default_rng(1)
+    for robot_m in np.arange(-3.0, 4.0, 0.1):
+        off_m = noise.normal(0.0, 0.01, 2)
+        layer.observe((robot_m + off_m[0], off_m[1], noise.normal(0.0, 0.002)), scan_of(past(robot_m)))
+    row, _ = GRID.index(np.array([0.0, 1.05]))
+    columns = slice(GRID.index(np.array([-1.8, 0.0]))[1], GRID.index(np.array([1.8, 0.0]))[1])
+    gaps = ~layer.lethal[row - 1 : row + 2, columns].any(axis=0)
+    assert np.count_nonzero(gaps) == 0
