@@ -10,7 +10,7 @@ PACKAGES := sern_core sern_runtime sern_relay sern_client sern_sim sern_twin ser
 # quarter less of CPU, and each worker of the tests would rewrite all of them anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup lint format types test wheel compiled test-compiled explore standstills lab bench performance endpoints figures cellular picture demo demo-twin schemas clean
+.PHONY: help setup lint format types test wheel compiled test-compiled explore standstills lab bench performance endpoints figures cellular navigation picture demo demo-twin schemas clean
 
 help:
 	@echo "make setup    create $(VENV) with pinned dependencies"
@@ -25,6 +25,7 @@ help:
 	@echo "make performance   as root: measure link, fleet and policies of docs/performance.md anew, two hours of an idle machine"
 	@echo "make endpoints, make figures   the other tables: ROS endpoints, 20 minutes; virtual time, summaries and codecs, 30"
 	@echo "make cellular RECORDINGS=DIR   the table of recorded cellular links, a minute; virtual time"
+	@echo "make navigation   the tables of navigation and perception, hours; DRIVES=FILE keeps the drives, and goes on with them"
 	@echo "make picture  the demo, and its picture for README.md"
 	@echo "make bench    the quick benchmarks;  make schemas: regenerate schemas/ and the configuration reference"
 
@@ -132,6 +133,14 @@ cellular: setup
 	mkdir -p build
 	$(BIN)/python -m benchmarks.cellular --data $(RECORDINGS) --json build/cellular.json
 	$(BIN)/python -m benchmarks.document build/cellular.json
+
+# Hours of drives: what was interrupted goes on where it was.
+DRIVES := build/drives.jsonl
+navigation: setup
+	mkdir -p build
+	$(BIN)/python -m benchmarks.navigation --resume $(DRIVES) --json build/navigation.json
+	$(BIN)/python -m benchmarks.perception --json build/perception.json
+	$(BIN)/python -m benchmarks.document build/navigation.json build/perception.json
 
 picture: setup
 	$(BIN)/sern demo --out build/demo --picture docs/images/demo.png

@@ -25,6 +25,7 @@ DOCUMENTS: Final = {
         ("link", "sensors", "robots", "relay", "footprint", "endpoints", "mmcf_lab", "thin_link", "cellular", "codecs"),
         DOCUMENT,
     ),
+    **dict.fromkeys(("navigation", "perception"), DOCUMENT),
     **dict.fromkeys(("mmcf", "mmcf_replay", "mmcf_recovery"), THEORY),
     "summaries": ROOT / "docs" / "summaries.md",
     "matrix": ROOT / "docs" / "lab.md",
@@ -103,6 +104,18 @@ TITLES: Final = {
     "talk_doubled": "talk doubled",
     "odom_received": "odom got",
     "cloud_received": "clouds got",
+    "from_percent": "95 % from, %",
+    "time_median_s": "time to the goal, median, s",
+    "spl_share": "SPL",
+    "interventions_run": "interventions a drive",
+    "collisions_all": "collisions",
+    "counted_drives": "drives",
+    "paper_success_percent": "success in the paper, %",
+    "paper_time_s": "time in the paper, s",
+    "paper_interventions_run": "interventions in the paper",
+    "counted_things": "things",
+    "flags_hour": "an hour",
+    "driven_hours": "hours driven",
 }
 """Titles of columns whose metric's name does not say it well."""
 PURE: Final = "1"

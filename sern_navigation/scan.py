@@ -29,6 +29,8 @@ VLP16_RAD: Final = tuple(math.radians(degrees) for degrees in range(-15, 16, 2))
 _FINE_M: Final = 0.05
 _BEFORE_M: Final = 0.12
 """An edge is said to be so far before a hole that is sure: rays are a quarter of a metre apart where it matters."""
+_OVER: Final = np.float32(1e-3)
+"""So much steeper a ray is that passes over another."""
 _TURN: Final = 2 * math.pi
 _MOST_TILT_RAD: Final = 0.7
 _MOST_M: Final = 1e4
@@ -344,6 +346,7 @@ class _Reading:
         ditch_m = np.full(options.sectors, np.inf)  # the edge of one, if what comes next is its other side
         least_m, full_m, one = np.float32(1e-3), np.float32(0.2), np.float32(1)
         step, sinks = np.float32(options.step_m), np.float32(-1.5 * options.step_m)
+        height = np.float32(self._height_m)
         seen = np.isfinite(low_z)
         anything = np.asarray(seen.any(axis=1))
         low_z = np.where(seen, low_z, 0)
@@ -367,6 +370,10 @@ class _Reading:
             sunk = bend * along < sinks
             dips = None
             if sunk.any():
+                # What the ray to the ground before is above has not sunk: that was no ground, but a part of a wall.
+                over = (z_m - height) * at_r > (at_z - height + _OVER * at_r) * r_m
+                is_ground &= over | ~sunk
+                sunk &= over
                 close = at_r <= options.drop_range_m
                 falls = sunk & ((tilt < -steepest) | ((bend < -fall) & close))
                 dips = sunk & (bend < -fall / 3) & close

@@ -8,29 +8,50 @@ by 2 cm), planner, controller and seeds are the same in all modes. Success is th
 
 import argparse
 import sys
+from pathlib import Path
+from typing import Final
 
 from benchmarks.common import Report, main, positive
 from benchmarks.navigation import costs, drives
 
+PARTS: Final = ("modes", "accuracies", "links", "discrepancies", "costs")
+
 
 def bench(options: argparse.Namespace, report: Report) -> None:
+    parts = options.parts or PARTS
     seeds = options.seeds or (2 if options.quick else 400)
-    some = max(2, seeds // 8)
-    with drives.drivers(options.processes) as pool:
-        drives.modes(seeds, report, pool)
-        if not options.quick:
-            drives.accuracies(some, report, pool)
-            drives.links(some, report, pool)
-    costs.discrepancies(2 if options.quick else 12, report)
-    costs.cycle(report, 60 if options.quick else 400)
-    costs.plans(report, 10 if options.quick else 100)
-    costs.scans(report, 30 if options.quick else 200)
-    report.note(f"{seeds} seeds a mode; twins that know less and links {some}")
+    some = min(seeds, options.some or (1 if options.quick else 60))
+    driving = {"modes": (drives.modes, seeds), "accuracies": (drives.accuracies, some), "links": (drives.links, some)}
+    if any(part in driving for part in parts):
+        with drives.drivers(options.processes) as pool:
+            known = drives.Drives(pool, options.resume)
+            for part, (drive, count) in driving.items():
+                if part in parts:
+                    drive(count, report, known)
+        report.note(f"drives are of commit {', '.join(sorted(known.commits))}")
+    if "discrepancies" in parts:
+        costs.discrepancies(2 if options.quick else 12, report)
+    if "costs" in parts:
+        costs.cycle(report, 60 if options.quick else 400)
+        costs.plans(report, 10 if options.quick else 100)
+        costs.scans(report, 30 if options.quick else 200)
+
+
+def part(text: str) -> str:
+    """One of `PARTS`, for arguments."""
+    if text not in PARTS:
+        raise argparse.ArgumentTypeError(f"{text} is none of {', '.join(PARTS)}")
+    return text
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("parts", nargs="*", type=part, metavar="PART", help=f"all, or {', '.join(PARTS)}")
     parser.add_argument("--seeds", type=positive, metavar="N", help="campuses a mode")
+    parser.add_argument("--some", type=positive, metavar="N", help="campuses of each accuracy and link")
     parser.add_argument("--processes", type=positive, metavar="N", help="drives at once; all cores")
+    parser.add_argument(
+        "--resume", type=Path, metavar="FILE", help="read the drives there, and add those that are missing"
+    )
 
 
 if __name__ == "__main__":

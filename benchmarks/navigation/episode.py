@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.navigation.campus import GRID, Campus
 from sern_navigation.costmap.layered import CostmapOptions
 from sern_navigation.costmap.obstacles import ObstacleOptions
-from sern_navigation.costmap.twin import TwinView
+from sern_navigation.costmap.twin import TwinOptions, TwinView
 from sern_navigation.navigator import Goal, Navigator, NavigatorOptions, State
 from sern_navigation.scan import Cloud
 from sern_sim.robot import BODY_RADIUS_M, LIDAR_HEIGHT_M, STEP_S, Pose2, SimulatedJackal
@@ -36,26 +36,34 @@ class Mode(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class LinkProfile:
-    """What the link does to the twin: how late it is, and for how long it is gone in each so many seconds."""
+    """What the link does to the twin: how late it is, for how long it is gone in each so many seconds, and when it is
+    gone for good."""
 
     name: str
     late_s: float
     gone_s: float = 0.0
     every_s: float = 60.0
+    dies_s: float = math.inf
 
     def stamp_s(self, now_s: float) -> float:
         """The moment that the newest of the twin is of which has arrived by now."""
         into_s = now_s % self.every_s
         said_s = now_s if into_s >= self.gone_s else now_s - into_s
-        return said_s - self.late_s
+        return min(said_s, self.dies_s) - self.late_s
+
+    @property
+    def always_fresh(self) -> bool:
+        """Whether the twin never becomes stale: of a place that stands still it is then as good as at once."""
+        gap_s = self.gone_s + self.late_s
+        return gap_s <= TwinOptions().staleness_s and self.dies_s + TwinOptions().staleness_s >= MOST_S + self.late_s
 
 
 PROFILES: Final = (
     LinkProfile("wifi", 0.02),
-    LinkProfile("lte", 0.08),
     LinkProfile("satcom", 0.6),
     LinkProfile("gone 5 s in 20", 0.1, 5.0, 20.0),
     LinkProfile("gone 30 s in 60", 0.1, 30.0, 60.0),
+    LinkProfile("gone after 20 s", 0.1, dies_s=20.0),
 )
 
 

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from sern_core.vocabulary.errors import UsageError
@@ -15,7 +16,6 @@ from sern_navigation.costmap.costs import (
     Costs,
     Mask,
 )
-from sern_twin.world.grid import Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,12 +55,22 @@ class InflationOptions:
         return costs.astype(np.uint8)
 
 
-def squared_cells(obstacles: Mask) -> Floats | None:
+def squared_cells(obstacles: Mask) -> NDArray[np.int32] | None:
     """The square of the distance [cells] to the nearest obstacle, (rows, columns); None where there is no obstacle."""
     if not obstacles.any():
         return None
-    distances: Floats = ndimage.distance_transform_edt(~obstacles)
-    return np.rint(distances * distances)
+    rows, columns = ndimage.distance_transform_edt(~obstacles, return_distances=False, return_indices=True)
+    rows -= np.arange(obstacles.shape[0], dtype=np.int32)[:, None]
+    columns -= np.arange(obstacles.shape[1], dtype=np.int32)
+    squares: NDArray[np.int32] = rows * rows + columns * columns
+    return squares
+
+
+def around_obstacles(obstacles: Mask, table: Costs) -> Costs | None:
+    """What cells (rows, columns) cost by their distance to the nearest obstacle; None where there is no obstacle.
+    `table`: by its square, in cells; beyond its end nothing."""
+    squares = squared_cells(obstacles)
+    return None if squares is None else np.append(table, np.uint8(0))[np.minimum(squares, len(table))]
 
 
 def inflate(costs: Costs, table: Costs, *, inflate_unknown: bool = False) -> Costs:
@@ -68,12 +78,9 @@ def inflate(costs: Costs, table: Costs, *, inflate_unknown: bool = False) -> Cos
 
     What is unknown becomes known only where the cost is that of a touch, or with `inflate_unknown` any, as in Nav2.
     """
-    squares = squared_cells(costs == LETHAL_OBSTACLE)
-    if squares is None:
+    added = around_obstacles(costs == LETHAL_OBSTACLE, table)
+    if added is None:
         return costs.copy()
-    near = squares < len(table)
-    added = np.zeros(costs.shape, np.uint8)
-    added[near] = table[squares[near].astype(np.int64)]
     unknown = costs == NO_INFORMATION
     least = FREE_SPACE + 1 if inflate_unknown else INSCRIBED_INFLATED_OBSTACLE
     return np.where(unknown, np.where(added >= least, added, costs), np.maximum(costs, added))

@@ -11,7 +11,7 @@ import numpy as np
 
 from sern_core.vocabulary.errors import UsageError
 from sern_navigation.costmap.costs import MAX_NON_OBSTACLE, Costs, Mask, Window
-from sern_navigation.costmap.inflation import InflationOptions, squared_cells
+from sern_navigation.costmap.inflation import InflationOptions, around_obstacles
 from sern_navigation.costmap.static import MapOutcome, fits
 from sern_twin.world.grid import Grid
 from sern_twin.world.patches import Cells
@@ -90,9 +90,5 @@ class TwinLayer:
 
 def softened(occupied: Mask, table: Costs) -> Costs:
     """What cells (rows, columns) cost by their distance to the occupied ones. `table`: by its square, in cells."""
-    found = np.zeros(occupied.shape, np.uint8)
-    squares = squared_cells(occupied)
-    if squares is not None:
-        near = squares < len(table)
-        found[near] = table[squares[near].astype(np.int64)]
-    return found
+    found = around_obstacles(occupied, table)
+    return np.zeros(occupied.shape, np.uint8) if found is None else found

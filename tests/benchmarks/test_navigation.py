@@ -1,12 +1,21 @@
 """What the benchmark of navigation says of paired runs, and the campuses that it drives on."""
 
+from concurrent.futures import Future, ProcessPoolExecutor
+from pathlib import Path
+from typing import cast
+
 import numpy as np
 import pytest
 
+from benchmarks.common import Report
+from benchmarks.navigation import episode
 from benchmarks.navigation.campus import GRID, cells_of
 from benchmarks.navigation.campus import campus as campus_of
+from benchmarks.navigation.drives import Drive, Drives, accuracies, links
 from benchmarks.navigation.episode import PROFILES, LinkProfile, Mode, Result
 from benchmarks.navigation.statistics import mcnemar, wilson
+from sern_core.vocabulary.errors import ConfigError
+from sern_tools.checkout import commit
 from sern_twin.world.patches import OCCUPIED
 
 
@@ -61,3 +70,61 @@ def test_success_is_weighted_by_the_way_that_it_took() -> None:
     assert result(reached=True, travelled_m=60.0).spl == 0.5
     assert result(reached=True, travelled_m=29.0).spl == 1.0, "a smoothed way may be a little shorter than the cells'"
     assert result(reached=False, travelled_m=30.0).spl == 0.0
+
+
+class Pool:
+    """Drives at once, without a robot."""
+
+    def __init__(self) -> None:
+        self.driven: list[Drive] = []
+
+    def submit(self, _driven: object, one: Drive) -> "Future[Result]":
+        self.driven.append(one)
+        future: Future[Result] = Future()
+        future.set_result(Result(one.seed, one.mode, one.seed % 2 == 0, 50.0, 30.0, 30.0, 0, 0, "succeeded none"))
+        return future
+
+
+def known(pool: Pool, kept: Path | None = None) -> Drives:
+    return Drives(cast("ProcessPoolExecutor", pool), kept)
+
+
+def test_a_drive_that_several_tables_want_is_driven_once() -> None:
+    pool = Pool()
+    drives, report = known(pool), Report("navigation")
+    links(4, report, drives)
+    accuracies(4, report, drives)
+    asked = [one for one in pool.driven if one.mode is Mode.SERN and one.accuracy == 0.9 and one.link is PROFILES[0]]
+    assert len(pool.driven) == len(set(pool.driven)) == 4 * (1 + 4 + 5) and len(asked) == 4
+    rows = [row for row in report.rows if row.system == "100% right"]
+    assert [row.metrics["success_percent"] for row in rows] == [50.0]
+
+
+def test_what_was_driven_before_is_not_driven_again(tmp_path: Path) -> None:
+    kept, asked = tmp_path / "drives.jsonl", [Drive(seed, Mode.SERN, 0.5, PROFILES[2]) for seed in range(3)]
+    first = known(Pool(), kept).results(asked[:2])
+    pool = Pool()
+    again = known(pool, kept)
+    assert again.results(asked)[:2] == first and pool.driven == asked[2:]
+    assert len(kept.read_text().splitlines()) == 3 and again.commits == {commit()}
+
+
+def test_a_file_that_has_other_lines_is_refused_by_its_line(tmp_path: Path) -> None:
+    kept = tmp_path / "drives.jsonl"
+    known(Pool(), kept).results([Drive(1, Mode.SERN)])
+    kept.write_text(kept.read_text() + '{"seed": 2}\n')
+    with pytest.raises(ConfigError, match="line 2 is no drive"):
+        known(Pool(), kept)
+
+
+def test_a_link_that_is_gone_for_good_brings_nothing_new() -> None:
+    dies = LinkProfile("dies", 0.1, dies_s=20.0)
+    assert [dies.stamp_s(now_s) for now_s in (5.0, 20.0, 99.0)] == pytest.approx([4.9, 19.9, 19.9])
+
+
+def test_a_link_that_is_late_and_never_stale_changes_no_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that its drives are those of the first profile."""
+    found, (first, late, *gone) = campus_of(3), PROFILES
+    assert late.always_fresh and not any(link.always_fresh for link in gone)
+    monkeypatch.setattr(episode, "MOST_S", 4.0)
+    assert episode.drive(3, found, Mode.SERN, link=first) == episode.drive(3, found, Mode.SERN, link=late)

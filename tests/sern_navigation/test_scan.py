@@ -1,6 +1,7 @@
 """The obstacle scan: ground on slopes, low things, edges and holes, what rays show, and clouds that are none."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from sern_navigation.scan import (
     obstacle_scan,
     planar_scan,
 )
+from sern_sim.robot import Pose2
 from sern_twin.world.grid import Floats
 from tests.exploring import seeds
 from tests.sern_navigation.worlds import Heights, box, jackal, level, looking_at, seen, world_of
@@ -193,6 +195,17 @@ def test_a_yard_looks_as_it_is() -> None:
     alone = np.ptp(sides, axis=0) < 0.2
     assert np.count_nonzero(alone) > 300
     assert scan.ranges_m[alone & (sides[1] < 9.5)] == pytest.approx(sides[1][alone & (sides[1] < 9.5)], abs=0.15)
+
+
+@pytest.mark.parametrize("seed", seeds(5))
+def test_level_ground_before_a_wall_has_no_edge(seed: int) -> None:
+    """A scanner trembles: a ring may meet a wall a bin before those below it do, and that is no ground that ends."""
+    robot = jackal(world_of([(1.0, -5.0, 1.0, 5.0, 3.0)]), seed)
+    for number in range(10):
+        here_m = 0.04 * number - 0.2
+        robot.state = replace(robot.state, pose=Pose2(here_m, 0.1 * number, 0.7 * number + seed))
+        scan = used(obstacle_scan(seen(robot, 5_760), OPTIONS))
+        assert not scan.drops.any() and scan.ranges_m.min() == pytest.approx(1.0 - here_m, abs=0.05)
 
 
 def test_the_scanner_need_not_be_in_the_middle() -> None:
