@@ -331,10 +331,11 @@ class _Reading:
         options, cells = self._options, self._shape[0] * self._shape[1]
         low_z = np.full(cells, np.inf, np.float32)
         np.minimum.at(low_z, key, z)
-        lowest = np.flatnonzero(z <= low_z[key])
+        up = z - low_z[key]
+        lowest = np.flatnonzero(up <= 0)
         low_r = np.zeros(cells, np.float32)
         low_r[key[lowest]] = r[lowest]
-        stands = self._stands(low_z, low_r, r, z, key).reshape(self._shape)
+        stands = self._stands(up, np.abs(r - low_r[key]), key).reshape(self._shape)
         low_z, low_r = low_z.reshape(self._shape), low_r.reshape(self._shape)
         ground = _Ground(self._shape)
         steepest, rise, fall = (
@@ -359,8 +360,10 @@ class _Reading:
             before = slope
             if not begun:
                 # At first it goes on as the robot stands, or level, whichever is nearer to what is seen.
-                first = np.where(np.abs(tilt - self._level) < np.abs(tilt), self._level, 0)
-                before = np.where(at_r > 0, slope, first)
+                first = at_r <= 0
+                if first[there].any():
+                    level = np.where(np.abs(tilt - self._level) < np.abs(tilt), self._level, 0)
+                    before = np.where(first, level, slope)
             bend = tilt - before
             too_steep = (up > step) & ((tilt > steepest) | (bend > rise))
             is_ground = there & ~(too_steep | stands[number])
@@ -389,20 +392,15 @@ class _Reading:
             ground.z_m[number], ground.r_m[number], ground.slope[number] = at_z, at_r, slope
         return ground
 
-    def _stands(
-        self,
-        low_z: NDArray[np.float32],
-        low_r: NDArray[np.float32],
-        r: NDArray[np.float32],
-        z: NDArray[np.float32],
-        key: Indices,
-    ) -> NDArray[np.bool_]:
-        """Bins in which something rises too steeply above the lowest point, which is then its foot and no ground."""
-        up = z - low_z[key]
-        along = np.abs(r - low_r[key]) * np.float32(math.tan(self._options.max_slope_rad))
+    def _stands(self, up: NDArray[np.float32], away: NDArray[np.float32], key: Indices) -> NDArray[np.bool_]:
+        """Bins in which something rises too steeply above the lowest point, which is then its foot and no ground.
+
+        `up`, `away`: how far points are above it and from it.
+        """
+        along = away * np.float32(math.tan(self._options.max_slope_rad))
         steep = (up > np.maximum(along, self._options.step_m)) & (up <= self._options.max_obstacle_height)
-        found = np.zeros(len(low_z), np.bool_)
-        found[key[steep]] = True
+        found = np.zeros(self._shape[0] * self._shape[1], np.bool_)
+        found[key[np.flatnonzero(steep)]] = True
         return found
 
     def _edges_m(
@@ -479,9 +477,9 @@ class _Reading:
         """How low the lowest ray beyond each bin passes; one that ends on the ground shows all of it."""
         flattest = np.full(self._shape[0] * self._shape[1], np.inf, np.float32)
         inclination = (self._z - np.float32(self._height_m)) / self._r
-        at = (self._shape[0] - 1) * self._shape[1] + self._sector
-        at[self._near] = self._key
-        np.minimum.at(flattest, at, inclination)
+        np.minimum.at(flattest, self._key, inclination[self._near])
+        far = np.flatnonzero(self._r >= self._options.range_max_m)
+        np.minimum.at(flattest[-self._shape[1] :], self._sector[far], inclination[far])
         beyond = np.minimum.accumulate(flattest.reshape(self._shape)[::-1], axis=0)[::-1]
         lowest = np.full(self._shape, np.inf, np.float32)
         middle = ((self._bins_m[1:] + self._bins_m[:-1]) / 2).astype(np.float32)[:-1, None]
