@@ -187,7 +187,10 @@ def obstacle_scan(cloud: Cloud, options: ScanOptions) -> ObstacleScan | Refused:
     with np.errstate(over="ignore"):
         ranges_m = np.sqrt(x * x + y * y)
     # What is not finite is not so near either.
-    used = np.flatnonzero((ranges_m >= options.range_min_m) & (ranges_m <= _MOST_M) & (np.abs(z) <= _MOST_M))
+    usable = (ranges_m >= options.range_min_m) & (ranges_m <= _MOST_M) & (np.abs(z) <= _MOST_M)
+    within = ranges_m < options.range_max_m
+    near = np.flatnonzero(usable & within)
+    used = np.concatenate((near, np.flatnonzero(usable & ~within)))
     if not math.isfinite(cloud.stamp_s) or not (len(used) or np.isfinite(points).all(axis=0).any()):
         return Refused(Unusable.NOT_FINITE, f"a cloud of {len(x)} points, none of them finite, or without a time")
     if len(used) < options.min_points:
@@ -197,7 +200,7 @@ def obstacle_scan(cloud: Cloud, options: ScanOptions) -> ObstacleScan | Refused:
             "see whether the scanner is covered",
         )
     places = x[used], y[used], z[used]
-    return _Reading(places, ranges_m[used], _level(cloud, options), options).scan(cloud.stamp_s)
+    return _Reading(places, ranges_m[used], len(near), _level(cloud, options), options).scan(cloud.stamp_s)
 
 
 def planar_scan(
@@ -273,12 +276,14 @@ def _sectors(bearings_rad: NDArray[np.floating[Any]], sectors: int) -> Indices:
 
 
 class _Reading:
-    """One cloud, x, y and z (n,) from the scanner on: its walks outwards, all bearings at once."""
+    """One cloud, x, y and z (n,) from the scanner on, first those within range: its walks outwards, all bearings at
+    once."""
 
     def __init__(
         self,
         places: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
         ranges_m: NDArray[np.float32],
+        within: int,
         level: NDArray[np.float32],
         options: ScanOptions,
     ) -> None:
@@ -292,7 +297,7 @@ class _Reading:
         self._sector = _sectors(np.arctan2(self._y, self._x), options.sectors)
         fine = np.arange(math.ceil(options.range_max_m / _FINE_M) + 1) * _FINE_M + 1e-6
         table = np.searchsorted(self._bins_m[1:-1], fine, side="right")
-        self._near = np.flatnonzero(self._r < options.range_max_m)
+        self._near, self._far = slice(0, within), slice(within, None)
         number = table[(self._r[self._near] / np.float32(_FINE_M)).astype(np.intp)]
         self._key = number * options.sectors + self._sector[self._near]
 
@@ -302,13 +307,12 @@ class _Reading:
         ground = self._walk(r, z, key)
         over = z - (ground.z_m.reshape(-1)[key] + ground.slope.reshape(-1)[key] * (r - ground.r_m.reshape(-1)[key]))
         obstacle = np.flatnonzero((over >= options.min_obstacle_height) & (over <= options.max_obstacle_height))
-        which = near[obstacle]
         nearest = np.full(options.sectors, np.inf, np.float32)
-        np.minimum.at(nearest, self._sector[which], r[obstacle])
+        np.minimum.at(nearest, self._sector[obstacle], r[obstacle])
         ranges_m = nearest.astype(np.float64)
         edges_m = np.minimum(ground.edges_m, self._missing(ground, ranges_m))
         edges_m[edges_m >= ranges_m] = np.inf
-        points_m, tops_m = self._marks(key[obstacle], over[obstacle], self._x[which], self._y[which])
+        points_m, tops_m = self._marks(key[obstacle], over[obstacle], self._x[obstacle], self._y[obstacle])
         at_edge = np.isfinite(edges_m)
         bearings = middles(options.sectors)[at_edge]
         edge_points = edges_m[at_edge, None] * np.stack((np.cos(bearings), np.sin(bearings)), axis=1)
@@ -478,8 +482,7 @@ class _Reading:
         flattest = np.full(self._shape[0] * self._shape[1], np.inf, np.float32)
         inclination = (self._z - np.float32(self._height_m)) / self._r
         np.minimum.at(flattest, self._key, inclination[self._near])
-        far = np.flatnonzero(self._r >= self._options.range_max_m)
-        np.minimum.at(flattest[-self._shape[1] :], self._sector[far], inclination[far])
+        np.minimum.at(flattest[-self._shape[1] :], self._sector[self._far], inclination[self._far])
         beyond = np.minimum.accumulate(flattest.reshape(self._shape)[::-1], axis=0)[::-1]
         lowest = np.full(self._shape, np.inf, np.float32)
         middle = ((self._bins_m[1:] + self._bins_m[:-1]) / 2).astype(np.float32)[:-1, None]
