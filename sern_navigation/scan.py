@@ -347,30 +347,31 @@ class _Reading:
         )
         at_r, at_z, slope = (np.zeros(options.sectors, np.float32) for _ in range(3))
         ditch_m = np.full(options.sectors, np.inf)  # the edge of one, if what comes next is its other side
+        ditches = False
         least_m, full_m, one = np.float32(1e-3), np.float32(0.2), np.float32(1)
         step, sinks = np.float32(options.step_m), np.float32(-1.5 * options.step_m)
         seen = np.isfinite(low_z)
         anything = np.asarray(seen.any(axis=1))
-        low_z = np.where(seen, low_z, 0)
-        begun = False
+        low_z[~seen] = np.nan  # what compares with nothing
+        may_be_ground = seen & ~stands
+        unbegun = np.flatnonzero(seen.any(axis=0))
         for number in range(self._shape[0]):
             if not anything[number]:
                 ground.z_m[number], ground.r_m[number], ground.slope[number] = at_z, at_r, slope
                 continue
-            there, r_m, z_m = seen[number], low_r[number], low_z[number]
+            r_m, z_m = low_r[number], low_z[number]
             along = np.maximum(r_m - at_r, least_m)
-            up = np.where(there, z_m - at_z, 0)
+            up = z_m - at_z
             tilt = up / along
             before = slope
-            if not begun:
+            if len(unbegun):
                 # At first it goes on as the robot stands, or level, whichever is nearer to what is seen.
-                first = at_r <= 0
-                if first[there].any():
-                    level = np.where(np.abs(tilt - self._level) < np.abs(tilt), self._level, 0)
-                    before = np.where(first, level, slope)
+                first, level = tilt[unbegun], self._level[unbegun]
+                before = slope.copy()
+                before[unbegun] = np.where(np.abs(first - level) < np.abs(first), level, 0)
             bend = tilt - before
             too_steep = (up > step) & ((tilt > steepest) | (bend > rise))
-            is_ground = there & ~(too_steep | stands[number])
+            is_ground = may_be_ground[number] & ~too_steep
             sunk = bend * along < sinks
             dips = None
             if sunk.any():
@@ -382,16 +383,19 @@ class _Reading:
                     ground.edges_m[falls] = np.minimum(ground.edges_m, edges_m)[falls]
                     ditch_m = np.where(dips, edges_m, ditch_m)
                     is_ground &= ~falls
-            if ditch_m.min() < np.inf:
+                    ditches = True
+            if ditches:
                 other_side = too_steep if dips is None else too_steep | (dips & stands[number])
                 ground.edges_m = np.where(other_side, np.minimum(ground.edges_m, ditch_m), ground.edges_m)
                 ditch_m[is_ground if dips is None else is_ground & ~dips] = np.inf
+                ditches = bool(ditch_m.min() < np.inf)
             np.copyto(at_z, z_m, where=is_ground)
             np.copyto(at_r, r_m, where=is_ground)
             # Two points close to each other say little of a slope.
             limited = np.minimum(np.maximum(tilt, -steepest), steepest) * np.minimum(along / full_m, one)
             np.copyto(slope, limited, where=is_ground)
-            begun = begun or bool(at_r.all())
+            if len(unbegun):
+                unbegun = unbegun[~is_ground[unbegun]]
             ground.seen[number] = is_ground
             ground.z_m[number], ground.r_m[number], ground.slope[number] = at_z, at_r, slope
         return ground
@@ -442,10 +446,9 @@ class _Reading:
         highest = np.float32(math.tan(rings[min(meeting, len(rings) - 1)] + gap_rad))
         low = np.flatnonzero(self._z - np.float32(self._height_m) < highest * self._r)
         elevations = np.arctan2(self._z[low] - np.float32(self._height_m), self._r[low])
-        ring = np.clip(np.searchsorted((rings[1:] + rings[:-1]) / 2, elevations), 0, len(rings) - 1)
-        close = np.abs(elevations - rings[ring]) < gap_rad / 2
-        there = np.zeros((len(rings), options.sectors), np.bool_)
-        there[ring[close], self._sector[low][close]] = True
+        there, sector = np.zeros((len(rings), options.sectors), np.bool_), self._sector[low]
+        for number in range(min(meeting + 1, len(rings))):
+            there[number, sector[np.abs(elevations - np.float32(rings[number])) < np.float32(gap_rad / 2)]] = True
         # A scanner with few bearings leaves some sectors out, by chance other ones in each ring.
         there |= np.roll(there, 1, axis=1) | np.roll(there, -1, axis=1)
         below = np.logical_and.accumulate(there, axis=0)
