@@ -1,4 +1,8 @@
-"""The map that scans make, and the robot's place on it: a scan is matched, then laid down where it fits."""
+"""The map that scans make, and the robot's place on it: a scan is matched, then laid down where it fits.
+
+To publish it, give `mapper.occupancy.classes()` to `sern_twin.world.map_updates.MapUpdates`, and what is due to
+`sern_runtime.map_bodies.MapWriter`.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

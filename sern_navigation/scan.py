@@ -189,7 +189,10 @@ def obstacle_scan(cloud: Cloud, options: ScanOptions) -> ObstacleScan | Refused:
     with np.errstate(over="ignore"):
         ranges_m = np.sqrt(x * x + y * y)
     # What is not finite is not so near either.
-    used = np.flatnonzero((ranges_m >= options.range_min_m) & (ranges_m <= _MOST_M) & (np.abs(z) <= _MOST_M))
+    usable = (ranges_m >= options.range_min_m) & (ranges_m <= _MOST_M) & (np.abs(z) <= _MOST_M)
+    within = ranges_m < options.range_max_m
+    near = np.flatnonzero(usable & within)
+    used = np.concatenate((near, np.flatnonzero(usable & ~within)))
     if not math.isfinite(cloud.stamp_s) or not (len(used) or np.isfinite(points).all(axis=0).any()):
         return Refused(Unusable.NOT_FINITE, f"a cloud of {len(x)} points, none of them finite, or without a time")
     if len(used) < options.min_points:
@@ -199,7 +202,7 @@ def obstacle_scan(cloud: Cloud, options: ScanOptions) -> ObstacleScan | Refused:
             "see whether the scanner is covered",
         )
     places = x[used], y[used], z[used]
-    return _Reading(places, ranges_m[used], _level(cloud, options), options).scan(cloud.stamp_s)
+    return _Reading(places, ranges_m[used], len(near), _level(cloud, options), options).scan(cloud.stamp_s)
 
 
 def planar_scan(
@@ -275,12 +278,14 @@ def _sectors(bearings_rad: NDArray[np.floating[Any]], sectors: int) -> Indices:
 
 
 class _Reading:
-    """One cloud, x, y and z (n,) from the scanner on: its walks outwards, all bearings at once."""
+    """One cloud, x, y and z (n,) from the scanner on, first those within range: its walks outwards, all bearings at
+    once."""
 
     def __init__(
         self,
         places: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
         ranges_m: NDArray[np.float32],
+        within: int,
         level: NDArray[np.float32],
         options: ScanOptions,
     ) -> None:
@@ -294,7 +299,7 @@ class _Reading:
         self._sector = _sectors(np.arctan2(self._y, self._x), options.sectors)
         fine = np.arange(math.ceil(options.range_max_m / _FINE_M) + 1) * _FINE_M + 1e-6
         table = np.searchsorted(self._bins_m[1:-1], fine, side="right")
-        self._near = np.flatnonzero(self._r < options.range_max_m)
+        self._near, self._far = slice(0, within), slice(within, None)
         number = table[(self._r[self._near] / np.float32(_FINE_M)).astype(np.intp)]
         self._key = number * options.sectors + self._sector[self._near]
 
@@ -304,13 +309,12 @@ class _Reading:
         ground = self._walk(r, z, key)
         over = z - (ground.z_m.reshape(-1)[key] + ground.slope.reshape(-1)[key] * (r - ground.r_m.reshape(-1)[key]))
         obstacle = np.flatnonzero((over >= options.min_obstacle_height) & (over <= options.max_obstacle_height))
-        which = near[obstacle]
         nearest = np.full(options.sectors, np.inf, np.float32)
-        np.minimum.at(nearest, self._sector[which], r[obstacle])
+        np.minimum.at(nearest, self._sector[obstacle], r[obstacle])
         ranges_m = nearest.astype(np.float64)
         edges_m = np.minimum(ground.edges_m, self._missing(ground, ranges_m))
         edges_m[edges_m >= ranges_m] = np.inf
-        points_m, tops_m = self._marks(key[obstacle], over[obstacle], self._x[which], self._y[which])
+        points_m, tops_m = self._marks(key[obstacle], over[obstacle], self._x[obstacle], self._y[obstacle])
         at_edge = np.isfinite(edges_m)
         bearings = middles(options.sectors)[at_edge]
         edge_points = edges_m[at_edge, None] * np.stack((np.cos(bearings), np.sin(bearings)), axis=1)
@@ -333,10 +337,11 @@ class _Reading:
         options, cells = self._options, self._shape[0] * self._shape[1]
         low_z = np.full(cells, np.inf, np.float32)
         np.minimum.at(low_z, key, z)
-        lowest = np.flatnonzero(z <= low_z[key])
+        up = z - low_z[key]
+        lowest = np.flatnonzero(up <= 0)
         low_r = np.zeros(cells, np.float32)
         low_r[key[lowest]] = r[lowest]
-        stands = self._stands(low_z, low_r, r, z, key).reshape(self._shape)
+        stands = self._stands(up, np.abs(r - low_r[key]), key).reshape(self._shape)
         low_z, low_r = low_z.reshape(self._shape), low_r.reshape(self._shape)
         ground = _Ground(self._shape)
         steepest, rise, fall = (
@@ -344,29 +349,32 @@ class _Reading:
         )
         at_r, at_z, slope = (np.zeros(options.sectors, np.float32) for _ in range(3))
         ditch_m = np.full(options.sectors, np.inf)  # the edge of one, if what comes next is its other side
+        ditches = False
         least_m, full_m, one = np.float32(1e-3), np.float32(0.2), np.float32(1)
         step, sinks = np.float32(options.step_m), np.float32(-1.5 * options.step_m)
         height = np.float32(self._height_m)
         seen = np.isfinite(low_z)
         anything = np.asarray(seen.any(axis=1))
-        low_z = np.where(seen, low_z, 0)
-        begun = False
+        low_z[~seen] = np.nan  # what compares with nothing
+        may_be_ground = seen & ~stands
+        unbegun = np.flatnonzero(seen.any(axis=0))
         for number in range(self._shape[0]):
             if not anything[number]:
                 ground.z_m[number], ground.r_m[number], ground.slope[number] = at_z, at_r, slope
                 continue
-            there, r_m, z_m = seen[number], low_r[number], low_z[number]
+            r_m, z_m = low_r[number], low_z[number]
             along = np.maximum(r_m - at_r, least_m)
-            up = np.where(there, z_m - at_z, 0)
+            up = z_m - at_z
             tilt = up / along
             before = slope
-            if not begun:
+            if len(unbegun):
                 # At first it goes on as the robot stands, or level, whichever is nearer to what is seen.
-                first = np.where(np.abs(tilt - self._level) < np.abs(tilt), self._level, 0)
-                before = np.where(at_r > 0, slope, first)
+                first, level = tilt[unbegun], self._level[unbegun]
+                before = slope.copy()
+                before[unbegun] = np.where(np.abs(first - level) < np.abs(first), level, 0)
             bend = tilt - before
             too_steep = (up > step) & ((tilt > steepest) | (bend > rise))
-            is_ground = there & ~(too_steep | stands[number])
+            is_ground = may_be_ground[number] & ~too_steep
             sunk = bend * along < sinks
             dips = None
             if sunk.any():
@@ -382,34 +390,32 @@ class _Reading:
                     ground.edges_m[falls] = np.minimum(ground.edges_m, edges_m)[falls]
                     ditch_m = np.where(dips, edges_m, ditch_m)
                     is_ground &= ~falls
-            if ditch_m.min() < np.inf:
+                    ditches = True
+            if ditches:
                 other_side = too_steep if dips is None else too_steep | (dips & stands[number])
                 ground.edges_m = np.where(other_side, np.minimum(ground.edges_m, ditch_m), ground.edges_m)
                 ditch_m[is_ground if dips is None else is_ground & ~dips] = np.inf
+                ditches = bool(ditch_m.min() < np.inf)
             np.copyto(at_z, z_m, where=is_ground)
             np.copyto(at_r, r_m, where=is_ground)
             # Two points close to each other say little of a slope.
             limited = np.minimum(np.maximum(tilt, -steepest), steepest) * np.minimum(along / full_m, one)
             np.copyto(slope, limited, where=is_ground)
-            begun = begun or bool(at_r.all())
+            if len(unbegun):
+                unbegun = unbegun[~is_ground[unbegun]]
             ground.seen[number] = is_ground
             ground.z_m[number], ground.r_m[number], ground.slope[number] = at_z, at_r, slope
         return ground
 
-    def _stands(
-        self,
-        low_z: NDArray[np.float32],
-        low_r: NDArray[np.float32],
-        r: NDArray[np.float32],
-        z: NDArray[np.float32],
-        key: Indices,
-    ) -> NDArray[np.bool_]:
-        """Bins in which something rises too steeply above the lowest point, which is then its foot and no ground."""
-        up = z - low_z[key]
-        along = np.abs(r - low_r[key]) * np.float32(math.tan(self._options.max_slope_rad))
+    def _stands(self, up: NDArray[np.float32], away: NDArray[np.float32], key: Indices) -> NDArray[np.bool_]:
+        """Bins in which something rises too steeply above the lowest point, which is then its foot and no ground.
+
+        `up`, `away`: how far points are above it and from it.
+        """
+        along = away * np.float32(math.tan(self._options.max_slope_rad))
         steep = (up > np.maximum(along, self._options.step_m)) & (up <= self._options.max_obstacle_height)
-        found = np.zeros(len(low_z), np.bool_)
-        found[key[steep]] = True
+        found = np.zeros(self._shape[0] * self._shape[1], np.bool_)
+        found[key[np.flatnonzero(steep)]] = True
         return found
 
     def _edges_m(
@@ -447,10 +453,9 @@ class _Reading:
         highest = np.float32(math.tan(rings[min(meeting, len(rings) - 1)] + gap_rad))
         low = np.flatnonzero(self._z - np.float32(self._height_m) < highest * self._r)
         elevations = np.arctan2(self._z[low] - np.float32(self._height_m), self._r[low])
-        ring = np.clip(np.searchsorted((rings[1:] + rings[:-1]) / 2, elevations), 0, len(rings) - 1)
-        close = np.abs(elevations - rings[ring]) < gap_rad / 2
-        there = np.zeros((len(rings), options.sectors), np.bool_)
-        there[ring[close], self._sector[low][close]] = True
+        there, sector = np.zeros((len(rings), options.sectors), np.bool_), self._sector[low]
+        for number in range(min(meeting + 1, len(rings))):
+            there[number, sector[np.abs(elevations - np.float32(rings[number])) < np.float32(gap_rad / 2)]] = True
         # A scanner with few bearings leaves some sectors out, by chance other ones in each ring.
         there |= np.roll(there, 1, axis=1) | np.roll(there, -1, axis=1)
         below = np.logical_and.accumulate(there, axis=0)
@@ -486,9 +491,8 @@ class _Reading:
         """How low the lowest ray beyond each bin passes; one that ends on the ground shows all of it."""
         flattest = np.full(self._shape[0] * self._shape[1], np.inf, np.float32)
         inclination = (self._z - np.float32(self._height_m)) / self._r
-        at = (self._shape[0] - 1) * self._shape[1] + self._sector
-        at[self._near] = self._key
-        np.minimum.at(flattest, at, inclination)
+        np.minimum.at(flattest, self._key, inclination[self._near])
+        np.minimum.at(flattest[-self._shape[1] :], self._sector[self._far], inclination[self._far])
         beyond = np.minimum.accumulate(flattest.reshape(self._shape)[::-1], axis=0)[::-1]
         lowest = np.full(self._shape, np.inf, np.float32)
         middle = ((self._bins_m[1:] + self._bins_m[:-1]) / 2).astype(np.float32)[:-1, None]

@@ -1,10 +1,10 @@
-"""Messages about a scene: scans and markers in, occupancy grids and their updates out."""
+"""Messages about a scene: scans and markers in, maps and discrepancies out."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -12,15 +12,13 @@ from sern_client.endpoints.twin.bodies import ODOMETRY, read_message, stamp_of
 from sern_core.vocabulary.errors import BodyError
 from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
+from sern_runtime.map_bodies import GRID, UPDATE, MapWriter
 from sern_twin.world.discrepancy import DiscrepancyKind, SeenDiscrepancy
-from sern_twin.world.grid import Floats, Grid
-from sern_twin.world.patches import Cells
+from sern_twin.world.grid import Floats
 
 SCAN: Final = "sensor_msgs/msg/LaserScan"
 MARKER: Final = "visualization_msgs/msg/Marker"
 MARKERS: Final = "visualization_msgs/msg/MarkerArray"
-GRID: Final = "nav_msgs/msg/OccupancyGrid"
-UPDATE: Final = "map_msgs/msg/OccupancyGridUpdate"
 MOST_SCAN_BYTES: Final = 512 * 1024
 CORNERS: Final = 16
 """A cylinder's outline has so many."""
@@ -103,47 +101,16 @@ def read_marker(body: bytes, encoding: Encoding) -> Marker:
 
 
 class Writer:
-    def __init__(self, grid: Grid, encoding: Encoding) -> None:
-        self._grid = grid
+    """Discrepancies of a scene as messages, in the frame and encoding of its map."""
+
+    def __init__(self, maps: MapWriter, encoding: Encoding) -> None:
+        self._maps = maps
         self._encoding = encoding
-        self._seq = 0
-
-    def whole(self, cells: Cells, *, stamp_ns: int) -> bytes:
-        """A nav_msgs/OccupancyGrid of all cells."""
-        grid, encoding = self._grid, self._encoding
-        info = ros_types.new(
-            "nav_msgs/msg/MapMetaData",
-            encoding,
-            map_load_time=ros_types.time_of(stamp_ns, encoding),
-            resolution=grid.cell_m,
-            width=grid.columns,
-            height=grid.rows,
-            origin=self._upright(grid.west_m, grid.south_m, 0.0),
-        )
-        header = self._header(stamp_ns)
-        message = ros_types.new(GRID, encoding, header=header, info=info, data=cells.reshape(-1))
-        return ros_types.serialise(message, GRID, encoding)
-
-    def update(self, cells: Cells, block: int, *, stamp_ns: int) -> bytes:
-        """A map_msgs/OccupancyGridUpdate of one block of all cells."""
-        rows, columns = self._grid.block_slices(block)
-        part = np.ascontiguousarray(cells[rows, columns])
-        message = ros_types.new(
-            UPDATE,
-            self._encoding,
-            header=self._header(stamp_ns),
-            x=columns.start,
-            y=rows.start,
-            width=part.shape[1],
-            height=part.shape[0],
-            data=part.reshape(-1),
-        )
-        return ros_types.serialise(message, UPDATE, self._encoding)
 
     def discrepancies(self, found: Sequence[SeenDiscrepancy], *, stamp_ns: int) -> bytes:
         """A visualization_msgs/MarkerArray of all there are, which takes the place of the one before: of each a
         cylinder, whose namespace is its kind, and its words."""
-        header = self._header(stamp_ns)
+        header = self._maps.header(stamp_ns)
         new = partial(ros_types.new, MARKER, self._encoding, header=header)
         markers = [new(action=_DELETE_ALL)]
         for number, thing in enumerate(found):
@@ -158,7 +125,7 @@ class Writer:
                         id=number,
                         type=shape,
                         action=_ADD,
-                        pose=self._upright(thing.east_m, thing.north_m, up_m),
+                        pose=self._maps.upright(thing.east_m, thing.north_m, up_m),
                         scale=ros_types.new(
                             "geometry_msgs/msg/Vector3", self._encoding, x=size[0], y=size[0], z=size[1]
                         ),
@@ -167,13 +134,3 @@ class Writer:
                     )
                 )
         return ros_types.serialise(ros_types.new(MARKERS, self._encoding, markers=markers), MARKERS, self._encoding)
-
-    def _upright(self, x_m: float, y_m: float, z_m: float) -> Any:
-        encoding = self._encoding
-        point = ros_types.new("geometry_msgs/msg/Point", encoding, x=x_m, y=y_m, z=z_m)
-        turn = ros_types.new("geometry_msgs/msg/Quaternion", encoding, w=1.0)
-        return ros_types.new("geometry_msgs/msg/Pose", encoding, position=point, orientation=turn)
-
-    def _header(self, stamp_ns: int) -> Any:
-        self._seq = (self._seq + 1) & 0xFFFFFFFF
-        return ros_types.header(stamp_ns, self._grid.frame_id, self._encoding, self._seq)

@@ -12,7 +12,7 @@ import asyncio
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Final
 
@@ -31,10 +31,12 @@ from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.names import plain_type
 from sern_core.vocabulary.types import Encoding, ObjectKind, TopicName
 from sern_runtime import clock, ros_types
+from sern_runtime.map_bodies import MapWriter
 from sern_runtime.metrics import Metrics
 from sern_twin.world.correction import corrected, map_cells, twin_cells
 from sern_twin.world.discrepancy import DiscrepancyKind, SeenDiscrepancy
 from sern_twin.world.grid import Grid
+from sern_twin.world.map_updates import MapUpdateOptions, MapUpdates
 from sern_twin.world.mesh import Mesh
 from sern_twin.world.occupancy import Occupancy
 from sern_twin.world.offset import object_offset
@@ -57,7 +59,7 @@ PERIOD_S: Final = 0.1
 WHOLE_S: Final = 5.0
 """How often the whole map is published at most: to who comes late, the last one is latched."""
 MOST_UPDATES: Final = 64
-"""Where more blocks change at once, the whole map is published."""
+"""So many blocks are published at once, at the most."""
 REPEAT_S: Final = 1.0
 """Where nothing changes, one block is published over again so often: who missed an update has it in the end, and who
 navigates by the map knows that it is one of now."""
@@ -116,18 +118,16 @@ class SceneNode:
         """What the twin has without what is seen, and where somebody added something; None: it has changed since."""
         self._pose_error_m = max((each.pose_error_m for each in options.scanners), default=0.0)
         self.obstacles = Obstacles(grid, self.unused)
-        self._writer = bodies.Writer(grid, encoding)
+        self._map_writer = MapWriter(grid, encoding)
+        self._writer = bodies.Writer(self._map_writer, encoding)
+        self._updates = MapUpdates(grid, MapUpdateOptions(WHOLE_S, 0.0, MOST_UPDATES, REPEAT_S))
         self._encoding = encoding
         self._subscriptions: dict[TopicName, list[Subscription]] = {}
         self._publishers: dict[TopicName, Publisher] = {}
-        self._changed: set[int] = set(range(grid.blocks)) if base is not None else set()
+        self._published_changes = -1
         self._changed_s: NDArray[np.float64] = np.full(grid.blocks, np.nan)
         self.changes = 0
         """How often any block has changed: while it is the same, so are the cells."""
-        self._whole_due_s = self._repeat_due_s = now()
-        self._whole = True
-        self._repeated = -1
-        """The block that was published over again last."""
         self._offsets_due_s = now()
         self._said = SayOnce(_log)
         self.differing = SceneDiscrepancies(
@@ -314,7 +314,6 @@ class SceneNode:
         return self._now() - self._changed_s
 
     def _change(self, key: BlockKey) -> None:
-        self._changed.add(key.block)
         if key.layer != "live":
             self._twin = None
         if key.layer != "base":
@@ -322,28 +321,16 @@ class SceneNode:
         self.changes += 1
 
     def _publish(self, now: float) -> None:
-        if not self._changed and not (self._whole and now >= self._whole_due_s):
-            if now < self._repeat_due_s or TopicName(self.options.publish) not in self._publishers:
-                return
-            self._repeated = (self._repeated + 1) % self.grid.blocks
-            self._say_blocks([self._repeated], now)
+        if self.changes == self._published_changes and self._updates.idle(now):
             return
-        cells, stamp_ns = self.cells(), self._wall_ns()
-        due = self._whole and now >= self._whole_due_s
-        if due or len(self._changed) > MOST_UPDATES:
-            self._whole, self._whole_due_s, self._repeat_due_s = False, now + WHOLE_S, now + REPEAT_S
-            self._say(self.options.publish, bodies.GRID, self._writer.whole(cells, stamp_ns=stamp_ns), stamp_ns)
+        self._published_changes = self.changes
+        stamp_ns, due = self._wall_ns(), self._updates.due(self.cells(), now)
+        if isinstance(due, tuple):
+            for update in due:
+                body = self._map_writer.update(update, stamp_ns=stamp_ns)
+                self._say(f"{self.options.publish}_updates", bodies.UPDATE, body, stamp_ns)
         else:
-            self._whole = True
-            self._say_blocks(sorted(self._changed), now)
-        self._changed.clear()
-
-    def _say_blocks(self, blocks: Sequence[int], now: float) -> None:
-        self._repeat_due_s = now + REPEAT_S
-        cells, stamp_ns = self.cells(), self._wall_ns()
-        for block in blocks:
-            update = self._writer.update(cells, block, stamp_ns=stamp_ns)
-            self._say(f"{self.options.publish}_updates", bodies.UPDATE, update, stamp_ns)
+            self._say(self.options.publish, bodies.GRID, self._map_writer.whole(due, stamp_ns=stamp_ns), stamp_ns)
 
     def _publish_discrepancies(self, now: float) -> None:
         if self.differing.changes == self._differing_changes or now < self._differing_due_s:

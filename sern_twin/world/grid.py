@@ -99,8 +99,8 @@ class Grid:
 
     @cached_property
     def grid_id(self) -> str:
-        """16 hexadecimal digits that are the same wherever all of the above is but `plane`: a patch says which grid it is
-        for. Where the frame is on the Earth a site with a map knows, and a robot need not."""
+        """16 hexadecimal digits that are the same wherever all of the above is but `plane`: a patch says which grid it
+        is for. Where the frame is on the Earth a site with a map knows, and a robot need not."""
         words = [self.frame_id]
         places = [self.west_m, self.south_m, self.cell_m]
         numbers = struct.pack("<3I", self.columns, self.rows, self.block_cells)

@@ -39,6 +39,11 @@ class Graph:
         self.handlers: dict[str, ServiceHandler] = {}
         self.open: set[str] = set()
 
+    @property
+    def endpoint(self) -> Any:
+        """As the endpoint of a node, of which it has what a node uses."""
+        return self
+
     def subscribe(self, name: TopicName, sink: Sink) -> Closing:
         self.sinks[name] = sink
         return Closing(lambda: self.sinks.pop(name, None))

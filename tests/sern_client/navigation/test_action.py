@@ -26,13 +26,13 @@ class Site:
         self.now_s = 100.0
         self.went: list[Goal] = []
         self.cancelled = 0
-        self.graph: Any = Graph()
+        self.graph = Graph()
         self.types = Types.known()
         self.action = NavigateToPose(
             TopicName("/navigate_to_pose"), self.types, go=self.went.append, cancel=self._cancel,
             now=lambda: self.now_s, wall_ns=lambda: round(self.now_s * 1e9),
         )  # fmt: skip
-        self.action.serve(self.graph, self.graph)
+        self.action.serve(self.graph.endpoint, self.graph.endpoint)
 
     def _cancel(self) -> None:
         self.cancelled += 1

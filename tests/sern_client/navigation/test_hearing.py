@@ -9,6 +9,7 @@ from sern_client.navigation import hearing
 from sern_client.navigation.options import Mount
 from sern_core.vocabulary.errors import BodyError
 from sern_core.vocabulary.types import Encoding
+from sern_navigation.navigator import Goal
 from sern_runtime import ros_types
 from sern_twin.world.grid import Grid
 from tests.sern_client.navigation import bodies
@@ -78,7 +79,7 @@ def test_an_update_says_where_it_is() -> None:
 
 
 def test_a_goal_may_leave_its_yaw_open() -> None:
-    assert hearing.read_goal(bodies.goal_body(1.0, 2.0), CDR) == hearing.Goal(1.0, 2.0, None, "map")
+    assert hearing.read_goal(bodies.goal_body(1.0, 2.0), CDR) == Goal(1.0, 2.0, None, "map")
     assert hearing.goal_of(bodies.goal(1.0, 2.0, 0.5)).yaw_rad == pytest.approx(0.5)
 
 
