@@ -43,7 +43,7 @@ def make_model(options: argparse.Namespace) -> int:
     from sern_perception.training.scans import SOURCE, make
 
     begin_s = time.monotonic()
-    budget = Budget(steps=options.steps or 2000, threads=options.threads)
+    budget = Budget(steps=options.steps or 2000, rare=4, threads=options.threads)
     scans = make(options.seed, options.scans, SOURCE)
     print(f"{options.scans} scans after {time.monotonic() - begin_s:.0f} s", flush=True)
     net = train(scans, options.seed, budget, told=lambda text: print(text, flush=True))

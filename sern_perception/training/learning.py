@@ -27,7 +27,7 @@ SAMPLES: Final = 2048
 """Pixels of a batch whose features are aligned: more covariances than these tell nothing new."""
 RARE: Final = (PointClass.CAR, PointClass.BRIDGE, PointClass.LOG)
 RIDGE: Final = 1e-3
-ALIGNS: Final = 10.0
+ALIGNS: Final = 3.0
 """The weight of the alignment beside the focal loss, of about 0.1."""
 _FAST: Final = torch.channels_last
 """Images are kept so in memory: twice as fast on a CPU."""

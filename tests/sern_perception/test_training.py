@@ -122,7 +122,7 @@ def test_ious_are_of_all_pixels_with_a_return() -> None:
             scores[:, PointClass.GROUND] = 1.0
             return scores
 
-    found = class_ious(Says(), scans())  # type: ignore[arg-type]
+    found = class_ious(Says(), scans())
     there = int(np.count_nonzero(scans().labels))
     ground = int(np.count_nonzero(scans().labels == PointClass.GROUND))
     assert found == {"ground": pytest.approx(ground / there), "car": 0.0}
