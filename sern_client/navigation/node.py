@@ -25,7 +25,7 @@ from sern_client.navigation.hearing import HeardCloud
 from sern_client.navigation.localising import Localiser, inverse, placed
 from sern_client.navigation.options import Localisation, NodeOptions, OnLinkLoss, Stamps
 from sern_client.navigation.own_map import OwnMap
-from sern_client.navigation.planning import PlannerProcess
+from sern_client.navigation.planning import Planner, PlannerProcess
 from sern_client.navigation.twin_map import TwinMap
 from sern_core.vocabulary.errors import BodyError, ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
@@ -82,6 +82,7 @@ class NavigationNode:
         endpoint: Endpoint,
         encoding: Encoding,
         *,
+        planner: Callable[[Navigator], Planner] = PlannerProcess,
         parts: OptionalParts | None = None,
         now: Callable[[], float] = clock.now,
         wall_ns: Callable[[], int] = time.time_ns,
@@ -90,7 +91,7 @@ class NavigationNode:
         self.grid: Final = grid
         generator = np.random.default_rng(options.seed)
         self.navigator: Final = Navigator(grid, generator, options.navigator, plans_itself=False)
-        self.planner: Final = PlannerProcess(self.navigator)
+        self.planner: Final = planner(self.navigator)
         self.localiser: Final = Localiser(options.start if options.localisation is Localisation.SCANS else (0, 0, 0))
         self.twin: Final = TwinMap(grid)
         self.unused: Counter[Unused] = Counter()
@@ -268,6 +269,11 @@ class NavigationNode:
             del self.cycles_s[:-1000]
             due_s = max(due_s + period_s, self._now() - period_s)  # what was missed is not made up for
             await asyncio.sleep(max(0.0, due_s - self._now()))
+
+    @property
+    def own_map_scans(self) -> int:
+        """How many scans the robot's own map was made of."""
+        return 0 if self._own_map is None else sum(self._own_map.mapper.counts.values())
 
     @property
     def makes_map(self) -> bool:

@@ -1,17 +1,41 @@
-"""Plans in a process of their own: one takes longer than a control cycle has, and holds the interpreter meanwhile."""
+"""Plans in a process of their own: one takes longer than a control cycle has, and holds the interpreter meanwhile.
+
+Requests and plans are pickled, each behind its length, over pipes that nobody else has. The process ends when its input
+does, so it never outlives this one, however that ends.
+"""
 
 import asyncio
 import logging
+import pickle
 import signal
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
-from typing import Final
+import struct
+import sys
+from contextlib import suppress
+from typing import BinaryIO, Final, Protocol
 
 from sern_navigation.global_plan import Plan, PlanRequest, plan_for
 from sern_navigation.navigator import Navigator
 
+_LENGTH: Final = struct.Struct("<Q")
+_COMMAND: Final = (sys.executable, "-P", "-m", "sern_client.navigation.planning")
 _log: Final = logging.getLogger(__name__)
+
+
+class Planner(Protocol):
+    """Who makes the plans that a navigator asks for."""
+
+    @property
+    def failures(self) -> int: ...
+
+    async def warm(self) -> None:
+        """Return when plans can be made."""
+        ...
+
+    def look(self) -> None:
+        """Have the plan made that the navigator wants, if it wants one. After each of its steps."""
+        ...
+
+    async def close(self) -> None: ...
 
 
 class PlannerProcess:
@@ -19,55 +43,83 @@ class PlannerProcess:
 
     def __init__(self, navigator: Navigator) -> None:
         self._navigator = navigator
-        self._pool = _pool()
+        self._process: asyncio.subprocess.Process | None = None
+        self._request: PlanRequest | None = None
         self._task: asyncio.Task[None] | None = None
+        self._wanted = asyncio.Event()
         self.failures = 0
         """How often the process ended, and was started again."""
 
     async def warm(self) -> None:
         """Return when the process runs: it imports scipy, which takes a second."""
-        await asyncio.get_running_loop().run_in_executor(self._pool, _nothing)
+        await self._ask(None)
+        self._task = asyncio.create_task(self._run(), name="plans")
 
     def look(self) -> None:
-        """Have the plan made that the navigator wants, if it wants one. After each of its steps."""
+        """Have the plan made that the navigator wants: of several, the last one. After each of its steps."""
         request = self._navigator.request()
-        if request is None:
-            return
-        if self._task is not None:
-            self._task.cancel()  # its goal is another now
-        self._task = asyncio.create_task(self._make(request), name="plan")
+        if request is not None:
+            self._request = request
+            self._wanted.set()
 
-    async def _make(self, request: PlanRequest) -> None:
+    async def _run(self) -> None:
+        while True:
+            await self._wanted.wait()
+            self._wanted.clear()
+            request, self._request = self._request, None
+            plan = await self._ask(request)
+            if plan is not None and request is not None:
+                self._navigator.planned(request, plan)
+
+    async def _ask(self, request: PlanRequest | None) -> Plan | None:
+        """The answer; None: the process has ended. The navigator gives up waiting then, and asks again."""
+        process = self._process
+        if process is None:
+            process = self._process = await asyncio.create_subprocess_exec(
+                *_COMMAND, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, start_new_session=True
+            )
+        assert process.stdin is not None and process.stdout is not None
         try:
-            plan = await asyncio.get_running_loop().run_in_executor(self._pool, _planned, request)
-        except BrokenProcessPool:
+            body = pickle.dumps(request, pickle.HIGHEST_PROTOCOL)
+            process.stdin.write(_LENGTH.pack(len(body)) + body)
+            await process.stdin.drain()
+            (length,) = _LENGTH.unpack(await process.stdout.readexactly(_LENGTH.size))
+            answer: Plan | None = pickle.loads(await process.stdout.readexactly(length))
+        except (OSError, asyncio.IncompleteReadError):
             self.failures += 1
-            _log.error("the process that plans has ended; it is started again")
-            self._pool.shutdown(wait=False)
-            self._pool = _pool()
-            return  # the navigator gives up waiting, and asks again
-        self._navigator.planned(request, plan)
+            self._process = None
+            _log.error("the process that plans has ended (%s); it is started again", await process.wait())
+            return None
+        return answer
 
     async def close(self) -> None:
         if self._task is not None:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
-        await asyncio.to_thread(self._pool.shutdown, wait=True, cancel_futures=True)
+        process, self._process = self._process, None
+        if process is not None:
+            assert process.stdin is not None
+            process.stdin.close()
+            with suppress(ProcessLookupError):
+                process.kill()
+            await process.wait()
 
 
-def _pool() -> ProcessPoolExecutor:
-    # Not a fork: this process has threads of its middleware.
-    return ProcessPoolExecutor(1, get_context("spawn"), initializer=_quietly)
+def _read(pipe: BinaryIO) -> bytes | None:
+    """None at its end."""
+    head = pipe.read(_LENGTH.size)
+    return pipe.read(_LENGTH.unpack(head)[0]) if len(head) == _LENGTH.size else None
 
 
-def _quietly() -> None:
-    """Ctrl-C is for the process that owns this one, which ends it."""
+def main() -> None:
+    """Answer requests on standard input until it ends. Ctrl-C is for the process that owns this one."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    while (body := _read(sys.stdin.buffer)) is not None:
+        request: PlanRequest | None = pickle.loads(body)
+        answer = pickle.dumps(None if request is None else plan_for(request), pickle.HIGHEST_PROTOCOL)
+        sys.stdout.buffer.write(_LENGTH.pack(len(answer)) + answer)
+        sys.stdout.buffer.flush()
 
 
-def _nothing() -> None:
-    return None
-
-
-def _planned(request: PlanRequest) -> Plan:
-    return plan_for(request)
+if __name__ == "__main__":
+    main()

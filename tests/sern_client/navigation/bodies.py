@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from sern_client.endpoints.clouds import cloud_body
+from sern_client.navigation.action import ACTION, Types
 from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 from sern_twin.world.grid import Grid
@@ -73,3 +74,12 @@ def goal_body(x_m: float, y_m: float, *, frame_id: str = "map") -> bytes:
 
 def link(connected: bool) -> bytes:
     return body("diagnostic_msgs/msg/DiagnosticStatus", level=0 if connected else 2)
+
+
+def goal_request(types: Types, uuid: bytes, x_m: float, y_m: float) -> Any:
+    """A request of NavigateToPose's send_goal, as a message."""
+    kind = types.send_goal.request
+    ident = ros_types.new_in(kind.store, "unique_identifier_msgs/msg/UUID", uuid=np.frombuffer(uuid, np.uint8))
+    return ros_types.new_in(
+        kind.store, kind.name, goal_id=ident, goal=ros_types.new_in(kind.store, f"{ACTION}_Goal", pose=goal(x_m, y_m))
+    )
