@@ -355,29 +355,30 @@ class _Reading:
         height = np.float32(self._height_m)
         seen = np.isfinite(low_z)
         anything = np.asarray(seen.any(axis=1))
-        low_z[~seen] = np.nan  # what compares with nothing
+        low_z[~seen] = 0  # as good as any: what comes of it is not asked for
         may_be_ground = seen & ~stands
         unbegun = np.flatnonzero(seen.any(axis=0))
         for number in range(self._shape[0]):
             if not anything[number]:
                 ground.z_m[number], ground.r_m[number], ground.slope[number] = at_z, at_r, slope
                 continue
-            r_m, z_m = low_r[number], low_z[number]
+            there, r_m, z_m = seen[number], low_r[number], low_z[number]
             along = np.maximum(r_m - at_r, least_m)
             up = z_m - at_z
             tilt = up / along
             before = slope
-            if len(unbegun):
+            begins = unbegun[there[unbegun]] if len(unbegun) else unbegun
+            if len(begins):
                 # At first it goes on as the robot stands, or level, whichever is nearer to what is seen.
-                first, level = tilt[unbegun], self._level[unbegun]
+                first, level = tilt[begins], self._level[begins]
                 before = slope.copy()
-                before[unbegun] = np.where(np.abs(first - level) < np.abs(first), level, 0)
+                before[begins] = np.where(np.abs(first - level) < np.abs(first), level, 0)
             bend = tilt - before
             too_steep = (up > step) & ((tilt > steepest) | (bend > rise))
-            is_ground = may_be_ground[number] & ~too_steep
-            sunk = bend * along < sinks
+            is_ground = np.greater(may_be_ground[number], too_steep)  # may be, and is not too steep
+            sunk = there & (bend * along < sinks)
             dips = None
-            if sunk.any():
+            if np.count_nonzero(sunk):
                 # What the ray to the ground before is above has not sunk: that was no ground, but a part of a wall.
                 over = (z_m - height) * at_r > (at_z - height + _OVER * at_r) * r_m
                 is_ground &= over | ~sunk
@@ -392,7 +393,9 @@ class _Reading:
                     is_ground &= ~falls
                     ditches = True
             if ditches:
-                other_side = too_steep if dips is None else too_steep | (dips & stands[number])
+                other_side = there & too_steep
+                if dips is not None:
+                    other_side |= dips & stands[number]
                 ground.edges_m = np.where(other_side, np.minimum(ground.edges_m, ditch_m), ground.edges_m)
                 ditch_m[is_ground if dips is None else is_ground & ~dips] = np.inf
                 ditches = bool(ditch_m.min() < np.inf)
@@ -401,7 +404,7 @@ class _Reading:
             # Two points close to each other say little of a slope.
             limited = np.minimum(np.maximum(tilt, -steepest), steepest) * np.minimum(along / full_m, one)
             np.copyto(slope, limited, where=is_ground)
-            if len(unbegun):
+            if len(begins):
                 unbegun = unbegun[~is_ground[unbegun]]
             ground.seen[number] = is_ground
             ground.z_m[number], ground.r_m[number], ground.slope[number] = at_z, at_r, slope
@@ -482,10 +485,11 @@ class _Reading:
         """One point for each bin of a sector that has an obstacle, and how high it is there."""
         tops = np.full(self._shape[0] * self._shape[1], -np.inf, np.float32)
         np.maximum.at(tops, key, over)
-        places = np.empty((len(tops), 2), np.float32)
-        places[key, 0], places[key, 1] = x, y
+        at_x, at_y = np.empty(len(tops), np.float32), np.empty(len(tops), np.float32)
+        at_x[key], at_y[key] = x, y
         there = np.flatnonzero(np.isfinite(tops))
-        return places[there].astype(np.float64), tops[there].astype(np.float64)
+        places = np.stack((at_x[there], at_y[there]), axis=1)
+        return places.astype(np.float64), tops[there].astype(np.float64)
 
     def _lowest(self, ground: "_Ground") -> NDArray[np.float32]:
         """How low the lowest ray beyond each bin passes; one that ends on the ground shows all of it."""

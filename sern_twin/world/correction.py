@@ -4,7 +4,7 @@ What is added lies over what is seen, and that over what the map says: people kn
 where the scans see through something that was added, or that the map has, it is cleared: the robot's live layer says
 CLEARED there, and a patch carries it to all sites like anything else that is seen. Of two robots' blocks the newer one
 counts, cell by cell, as always. What was added stays in its own layer, and is on the map again once its cells are no
-longer cleared. LASTING is never cleared: a hole is seen by no planar scanner.
+longer cleared. LASTING is never cleared: a hole is seen by no planar scanner, nor is water.
 """
 
 import numpy as np
@@ -32,7 +32,7 @@ def twin_cells(base: Cells, twin_only: Cells) -> Cells:
 
 def map_cells(base: Cells, live: Cells, twin_only: Cells) -> Cells:
     """The map of all layers, (rows, columns), in which nothing is LASTING or CLEARED any more."""
-    found: Cells = np.where(live != UNKNOWN, live, base)
+    found: Cells = np.where((live != UNKNOWN) & (base != LASTING), live, base)
     added = (twin_only != UNKNOWN) & ((live != CLEARED) | (twin_only == LASTING))
     found[added] = twin_only[added]
     found[found == CLEARED] = FREE

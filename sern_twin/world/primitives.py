@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sern_twin.geodesy import TangentPlane
 from sern_twin.world.grid import Floats, Grid
 from sern_twin.world.mesh import Mesh, joined
-from sern_twin.world.patches import OCCUPIED, UNKNOWN, Cells
+from sern_twin.world.patches import FREE, LASTING, OCCUPIED, UNKNOWN, Cells
 from sern_twin.world.tags import Kind, Tags, height_m, kind_of, width_m
 from sern_twin.world.terrain import Terrain
 
@@ -110,10 +110,12 @@ def rasterised(things: Sequence[Primitive], grid: Grid) -> NDArray[np.uint8]:
 
 
 def base_cells(layer: NDArray[np.uint8]) -> Cells:
-    """A class layer as a scene's base: buildings, barriers and water 100, roads and paths 0, else -1."""
+    """A class layer as a scene's base: buildings and barriers OCCUPIED, water LASTING, roads and paths FREE, else
+    UNKNOWN. Scans see over water, and over a ditch, and do not make it free by that."""
     cells = np.full(layer.shape, UNKNOWN, np.int8)
     cells[np.isin(layer, list(_BLOCKED))] = OCCUPIED
-    cells[np.isin(layer, list(_FREE))] = 0
+    cells[layer == Kind.WATER] = LASTING
+    cells[np.isin(layer, list(_FREE))] = FREE
     return cells
 
 

@@ -38,7 +38,7 @@ async def test_a_robot_and_a_site_share_a_scene(tmp_path: Path) -> None:
         site = await lab.connected(lab.recorder_file("site", "/nothing", scene=SCENE))
         here, there = node_of(robot), node_of(site)
         await until(lambda: int((there.scene.merged("live") == OCCUPIED).sum()) > 200, "the site has what is seen")
-        there.obstacles.heard(marker(x_m=0.0, y_m=3.9), Encoding.CDR)
+        there.obstacles.heard(marker(x_m=0.0, y_m=3.9, namespace="lasting"), Encoding.CDR)  # else it may be cleared
         row, column = (int(value) for value in here.grid.index([0.0, 3.9]))
         await until(lambda: here.cells()[row, column] == OCCUPIED, "the robot has what was added")
         there.obstacles.heard(marker(action=3), Encoding.CDR)
