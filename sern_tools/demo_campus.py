@@ -26,12 +26,12 @@ POINTS: Final = 201
 DITCH_Y_M: Final = -4.0
 DITCH_HALF_M: Final = 0.9
 DITCH_DEPTH_M: Final = 0.8
-STREET_X_M: Final = -2.0
+STREET_X_M: Final = 5.0
 STREET_HALF_M: Final = 1.6
-BRIDGE_X_M: Final = 12.0
+BRIDGE_X_M: Final = -15.0
 BRIDGE_HALF_M: Final = 0.8
-START: Final = Pose2(-15.0, -9.0, 0.0)
-GOAL_M: Final = (0.0, 9.0)
+START: Final = Pose2(-6.0, -10.0, 0.0)
+GOAL_M: Final = (-2.0, 9.0)
 CAR_M: Final = (4.2, 1.7, 1.4)
 """Length, width and height of the car, which stands across the street."""
 LOG_M: Final = (1.5, 0.25)
@@ -42,14 +42,14 @@ LEAST_M2: Final = 4.0
 """What is left of a building at the edge is at least so large."""
 CLEAR_M: Final = 2.0
 """No building stands nearer to ditch, street, start and goal."""
-MAP_MIDDLE_M: Final = (45.0, -6.0)
+MAP_MIDDLE_M: Final = (42.0, -9.0)
 """Where the middle of the place lies on the map: east and north of the middle of what the map has."""
 Corners = tuple[tuple[float, float], ...]
 GRID: Final = Grid(-HALF_M, -HALF_M, 0.1, 400, 400, frame_id="odom")
 _MADE_UP: Final[tuple[Corners, ...]] = (
-    ((-17.0, 3.0), (-6.0, 3.0), (-6.0, 13.0), (-17.0, 13.0)),
-    ((5.0, 4.0), (16.0, 4.0), (16.0, 12.0), (5.0, 12.0)),
-    ((-12.0, -18.0), (0.0, -18.0), (0.0, -12.5), (-12.0, -12.5)),
+    ((-17.0, 6.0), (-8.0, 6.0), (-8.0, 15.0), (-17.0, 15.0)),
+    ((3.0, 6.0), (14.0, 6.0), (14.0, 14.0), (3.0, 14.0)),
+    ((-3.0, -18.0), (10.0, -18.0), (10.0, -12.0), (-3.0, -12.0)),
 )
 
 
@@ -80,9 +80,9 @@ class Campus:
         return json.dumps({"type": "FeatureCollection", "features": features})
 
     def added(self) -> tuple[tuple[str, Pose2, tuple[float, float, float]], ...]:
-        """What people have added to the twin, by name: place and size [m]. The car stands there; the logs, before and
-        behind the bridge, do not."""
-        ways = ((BRIDGE_X_M, DITCH_Y_M - DITCH_HALF_M - 1.0), (BRIDGE_X_M, DITCH_Y_M + DITCH_HALF_M + 0.8))
+        """What people have added to the twin, by name: place and size [m]. The car stands there; the logs, at both ends
+        of the bridge, do not."""
+        ways = [(BRIDGE_X_M, DITCH_Y_M + side * (DITCH_HALF_M + 0.2)) for side in (-1, 1)]
         logs = [("logs", Pose2(x_m, y_m, 0.0), (2 * LOG_M[0], LOG_M[1], LOG_M[1])) for x_m, y_m in ways]
         return (("car", Pose2(STREET_X_M, DITCH_Y_M, 0.0), CAR_M), *logs)
 
@@ -208,6 +208,7 @@ def _of_map(path: Path) -> tuple[tuple[Corners, ...], TangentPlane]:
         [
             shapely.box(-HALF_M, DITCH_Y_M - DITCH_HALF_M, HALF_M, DITCH_Y_M + DITCH_HALF_M).buffer(CLEAR_M),
             shapely.box(STREET_X_M - STREET_HALF_M, -10.0, STREET_X_M + STREET_HALF_M, 4.0).buffer(0.5),
+            shapely.box(BRIDGE_X_M - CLEAR_M, -10.0, BRIDGE_X_M + CLEAR_M, 2.0),
             shapely.Point(START.x_m, START.y_m).buffer(CLEAR_M), shapely.Point(*GOAL_M).buffer(CLEAR_M),
         ]
     )  # fmt: skip

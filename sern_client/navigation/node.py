@@ -117,8 +117,8 @@ class NavigationNode:
         self._cloud: _Heard | None = None
         self._scan: tuple[int, Pose, ObstacleScan] | None = None
         """Of the robot's own map: stamp, place and scan that are still to be laid down."""
-        self._problem = ""
-        """What is wrong with what is heard, in a line."""
+        self._problems: dict[str, str] = {}
+        """What is wrong with what is heard, in a line for each topic."""
         self._goal: Goal | None = None
         self._pursued = False
         self._waits = False
@@ -161,8 +161,7 @@ class NavigationNode:
                 hear(info, body)
             except (BodyError, ConfigError) as error:
                 self.unused[Unused.UNREADABLE] += 1
-                self._problem = f"{info.name}: {error}"
-                self._said(self._problem, str(info.name))
+                self._complain(info.name, f"{info.name}: {error}")
             return True
 
         return sink
@@ -179,12 +178,14 @@ class NavigationNode:
         fixed = self.options.localisation is Localisation.ODOMETRY
         if fixed and said.frame_id != self.grid.frame_id:
             self.unused[Unused.OTHER_FRAME] += 1
-            self._problem = (
+            self._complain(
+                info.name,
                 f"{info.name} is in frame {said.frame_id!r}, the grid in {self.grid.frame_id!r}: name the odometry of "
-                "a localisation, or set localisation: scans"
+                "a localisation, or set localisation: scans",
             )
-            self._said(self._problem, str(info.name))
-        elif not self.localiser.heard(said):
+        elif self.localiser.heard(said):
+            self._problems.pop(info.name, None)
+        else:
             self.unused[Unused.NO_PLACE] += 1
 
     def _hear_map(self, info: TopicInfo, body: bytes) -> None:
@@ -264,7 +265,6 @@ class NavigationNode:
         while True:
             begin_s = self._now()
             self.cycle()
-            self.cycles += 1
             self.cycles_s.append(self._now() - begin_s)
             del self.cycles_s[:-1000]
             due_s = max(due_s + period_s, self._now() - period_s)  # what was missed is not made up for
@@ -295,6 +295,7 @@ class NavigationNode:
 
     def cycle(self) -> None:
         """One of them: see, decide, drive, tell."""
+        self.cycles += 1
         now, wall_ns = self._now(), self._wall_ns()
         self._heed_link()
         pose = self.localiser.at(wall_ns)
@@ -322,14 +323,13 @@ class NavigationNode:
             cloud = hearing.read_points(heard.body, heard.info.encoding, self.options.lidar)
         except BodyError as error:
             self.unused[Unused.UNREADABLE] += 1
-            self._problem = f"{heard.info.name}: {error}"
-            self._said(self._problem, str(heard.info.name))
+            self._complain(heard.info.name, f"{heard.info.name}: {error}")
             return None
         expected = self.options.lidar.frame_id
         if expected is not None and cloud.frame_id != expected:
             self.unused[Unused.OTHER_FRAME] += 1
-            self._problem = f"{heard.info.name} is in frame {cloud.frame_id!r}, and lidar.frame_id is {expected!r}"
-            self._said(self._problem, str(heard.info.name))
+            said = f"{heard.info.name} is in frame {cloud.frame_id!r}, and lidar.frame_id is {expected!r}"
+            self._complain(heard.info.name, said)
             return None
         stamp_ns = cloud.stamp_ns if self.options.stamps is Stamps.HEADER else heard.came_ns
         return self._placed(cloud, pose, stamp_ns, wall_ns, now)
@@ -354,7 +354,7 @@ class NavigationNode:
         found = obstacle_scan(moved, self.options.navigator.scan)
         if not isinstance(found, ObstacleScan):
             return moved  # the navigator counts why, and says so
-        self._problem = ""
+        self._problems.pop(self.options.topics.cloud, None)
         self._say(self.options.topics.scan, writing.SCAN, self._writer.scan(found, stamp_ns=wall_ns), wall_ns)
         if self._own_map is not None and pose is not None:
             self._scan = wall_ns, pose, found
@@ -418,11 +418,18 @@ class NavigationNode:
         status = self.status
         level = 2 if status.state is State.ABORTED else 1 if status.code is not Code.NONE or self._waits else 0
         said = ": ".join(filter(None, (status.state.value, status.message)))
-        if not self._pursued and self._problem:
-            return max(level, 1), f"{said}; {self._problem}"
-        if self.twin.problem:
-            return max(level, 1), f"{said}; {self.twin.problem}"
-        return level, said
+        problem = self.problem
+        return (max(level, 1), f"{said}; {problem}") if problem else (level, said)
+
+    @property
+    def problem(self) -> str:
+        """What is wrong with what is heard, in a line; empty: nothing."""
+        return "; ".join(filter(None, (*self._problems.values(), self.twin.problem)))
+
+    def _complain(self, topic: str, line: str) -> None:
+        """Until something of that topic is right."""
+        self._problems[topic] = line
+        self._said(line, topic)
 
     def to_json(self) -> dict[str, object]:
         """What `/api/navigation` says."""
@@ -440,7 +447,7 @@ class NavigationNode:
             "linked": self.linked,
             "twin_age_s": None if self.twin.stamp_s is None else now - self.twin.stamp_s,
             "cycle_p99_ms": 1e3 * self.cycle_p99_s if self.cycles_s else None,
-            "problem": self._problem or self.twin.problem,
+            "problem": self.problem,
             "unused": self.counts(),
             "twin": dict(self.twin.outcomes),
             "monitor": {action.value: count for action, count in self.navigator.monitor.counts.items()},
@@ -457,9 +464,9 @@ class NavigationNode:
         if not self.cycles:
             return Health(ok=False, reason="starting")
         if self.localiser.at(self._wall_ns()) is None:
-            return Health(ok=False, reason=self._problem or f"no odometry on {self.options.topics.odometry}")
+            return Health(ok=False, reason=self.problem or f"no odometry on {self.options.topics.odometry}")
         if not self.navigator.sees(self._now()):
-            return Health(ok=False, reason=self._problem or f"no fresh clouds on {self.options.topics.cloud}")
+            return Health(ok=False, reason=self.problem or f"no fresh clouds on {self.options.topics.cloud}")
         return Health(ok=True, reason=self.words()[1])
 
     def counts(self) -> dict[str, int]:

@@ -83,3 +83,9 @@ def goal_request(types: Types, uuid: bytes, x_m: float, y_m: float) -> Any:
     return ros_types.new_in(
         kind.store, kind.name, goal_id=ident, goal=ros_types.new_in(kind.store, f"{ACTION}_Goal", pose=goal(x_m, y_m))
     )
+
+
+def no_points(stamp_ns: int) -> bytes:
+    """A cloud without any."""
+    name = "sensor_msgs/msg/PointCloud2"
+    return body(name, header=ros_types.header(stamp_ns, "velodyne", CDR), height=1, point_step=16)

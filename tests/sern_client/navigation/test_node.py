@@ -247,7 +247,7 @@ async def test_without_clouds_the_robot_stands_and_then_gives_up() -> None:
     ("body", "says"),
     [
         (lambda at: bodies.cloud(at, np.full((50, 4), np.nan)), "not_finite"),
-        (lambda at: bodies.cloud(at, np.empty((0, 4))), "empty"),
+        (bodies.no_points, "empty"),
         (lambda at: bodies.cloud(at - 5 * 10**9, np.ones((50, 4))), "no_pose"),
         (lambda at: b"\0\1\0\0rubbish", "unreadable"),
         (lambda at: bodies.cloud(at, np.ones((50, 4)), "camera"), "other_frame"),
@@ -293,9 +293,9 @@ async def test_what_the_twin_says_makes_a_way_dearer() -> None:
     """A wall that the twin has across the straight way, with a gap far to the left."""
     async with scene() as site:
         cells = np.zeros(GRID.shape, np.int8)
-        cells[:65, 48:53] = 100  # x = 0, from the south up to y = 1.5
+        cells[:65, 68:73] = 100  # x = 2, where no scan reaches yet, from the south up to y = 1.5
         site.graph.give("/twin/scene/map", bodies.grid_map(GRID, cells))
-        await site.give(2.0, 0.0)
+        await site.give(4.0, 0.0)
         for _ in range(2):
             site.turn()
         assert max(pose.pose.position.y for pose in site.graph.last("/plan").poses) > 1.5

@@ -27,6 +27,8 @@ def cell(value: int) -> Cells:
         (FREE, CLEARED, OCCUPIED, FREE),
         (OCCUPIED, CLEARED, UNKNOWN, FREE),
         (FREE, CLEARED, LASTING, OCCUPIED),
+        (LASTING, FREE, UNKNOWN, OCCUPIED),
+        (LASTING, CLEARED, UNKNOWN, OCCUPIED),
         (FREE, UNKNOWN, LASTING, OCCUPIED),
         (UNKNOWN, 40, UNKNOWN, 40),
     ],

@@ -13,6 +13,7 @@ import shapely
 
 from sern_twin.geodesy import TangentPlane
 from sern_twin.world.grid import Grid
+from sern_twin.world.patches import LASTING
 from sern_twin.world.primitives import (
     MOST_POINTS,
     Feature,
@@ -115,6 +116,7 @@ def test_a_class_layer_has_the_highest_thing_of_each_cell() -> None:
     assert {*columns.tolist()} == set(range(10, 70)), "the fence is thinner than a cell, and has no hole"
     cells = base_cells(layer)
     assert (cells[layer == Kind.BUILDING] == 100).all() and (cells[layer == Kind.ROAD] == 0).all()
+    assert base_cells(np.array([[Kind.WATER]], np.uint8)).tolist() == [[LASTING]], "scans do not see it"
     assert (cells[layer == Kind.VEGETATION] == -1).all() and (cells[layer == 0] == -1).all()
 
 
