@@ -95,6 +95,10 @@ def detect(document: Document) -> type[FileModel]:
         if kind is None:
             raise document.error(("sern_key",), f"is not accepted as it is; accepted: {', '.join(_KEY_FILES)}")
         return kind
+    if "grid" in data and not data.keys() & {"client", "relay"}:
+        from sern_runtime.config.navigation import NavigationFile  # numpy and scipy, which others need not have
+
+        return NavigationFile
     # A client file has a section `relay` too: its connection to the relay.
     if "client" in data or "endpoint" in data:
         return ClientFile
@@ -103,7 +107,9 @@ def detect(document: Document) -> type[FileModel]:
     words = ("client", "endpoint", "relay", "sern_key")
     close = [word for key in data for word in difflib.get_close_matches(key, words, n=1)]
     hint = f" (did you mean {close[0]}?)" if close else ""
-    raise document.error((), f"is no client file (client, relay, endpoint), relay file (relay) or key file{hint}")
+    raise document.error(
+        (), "is no client file (client, relay, endpoint), relay file (relay), navigation file (grid) or key file" + hint
+    )
 
 
 def _lines(console: Console, lines: Iterable[str]) -> None:

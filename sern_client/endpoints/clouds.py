@@ -96,7 +96,8 @@ def cloud_body(points: NDArray[np.float32], stamp_ns: int, frame_id: str, encodi
         )
         for i, name in enumerate(names)
     ]
-    data = np.ascontiguousarray(points[:, :4], dtype="<f4").view(np.uint8).reshape(len(points), -1)
+    numbers = np.ascontiguousarray(points[:, :4], dtype="<f4")
+    data = numbers.view(np.uint8).reshape(len(points), 4 * numbers.shape[1])
     if "label" in names:
         labels = np.ascontiguousarray(points[:, 4:5], dtype="<u2").view(np.uint8)
         data = np.concatenate([data, labels.reshape(len(points), 2)], axis=1)

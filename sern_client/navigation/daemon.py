@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -32,6 +33,7 @@ from sern_runtime.ros_files import installed_files
 from sern_runtime.sdnotify import Notifier, Watchdog
 
 if TYPE_CHECKING:
+    from sern_client.navigation.perceiving import Perception
     from sern_runtime.http import HttpServer
 
 NODE_NAME: Final = "sern_navigation"
@@ -63,11 +65,14 @@ class NavigationDaemon:
         self.loaded = loaded
         self.notifier = Notifier.from_environment()
         self.errors = InternalErrors()
-        self.parts = OptionalParts("http", "mapping", "metrics")
+        self.parts = OptionalParts("http", "mapping", "metrics", "perception")
         model = loaded.model
         self.encoding = Encoding.ROS1 if model.endpoints[0].kind == "ros1" else Encoding.CDR
         self.endpoint = self._make_endpoint()
         self.node = NavigationNode(node_options(model), model.grid.grid, self.endpoint, self.encoding, parts=self.parts)
+        self.perception = self._make_perception()
+        if self.perception is not None:
+            self.node.hears_clouds = self.perception.heard
         self._http: HttpServer | None = None
         self._started = False
         self.tasks: list[asyncio.Task[None]] = []
@@ -95,6 +100,21 @@ class NavigationDaemon:
         files = installed_files(map(self.loaded.resolve, model.type_paths))
         return ActionEndpoint(endpoint, services, self.encoding, [rule], namespace="/", files=files)
 
+    def _make_perception(self) -> "Perception | None":
+        section = self.loaded.model.perception
+        if section is None:
+            return None
+        from sern_client.navigation.perceiving import Perception, PerceptionOptions
+        from sern_perception.projection import ImageShape
+
+        shape = ImageShape(
+            section.rings, section.columns, math.radians(section.low_deg), math.radians(section.high_deg)
+        )
+        model = None if section.model is None else self.loaded.resolve(section.model)
+        options = PerceptionOptions(section.labels, section.obstacles, section.rate_hz, shape, model)
+        with blamed_on(self.loaded.path, "perception"):
+            return Perception(options, self.encoding, self.node.say)
+
     async def start(self) -> None:
         """ConfigError: the graph cannot be joined, or the action not be served there."""
         self.errors.watch(asyncio.get_running_loop())
@@ -114,6 +134,9 @@ class NavigationDaemon:
         if self.node.makes_map:
             kept = self.parts.keep("mapping", self.node.keep_map, reset=lambda: None)
             self.tasks.append(asyncio.create_task(kept, name="mapping"))
+        if self.perception is not None:
+            kept = self.parts.keep("perception", self.perception.run, reset=lambda: None)
+            self.tasks.append(asyncio.create_task(kept, name="perception"))
         self.tasks.append(asyncio.create_task(self._tick(), name="tick"))
         kinds = " and ".join(section.kind for section in model.endpoints)
         self.notifier.ready(f"navigation at {kinds}")

@@ -98,6 +98,8 @@ class NavigationNode:
         self.ended: Counter[State] = Counter()
         """Goals, by how they ended."""
         self.action: NavigateToPose | None = None
+        self.hears_clouds: Callable[[bytes, Encoding], None] | None = None
+        """Who else looks at clouds."""
         self.cycles = 0
         self.cycles_s: list[float] = []
         """How long the last cycles took."""
@@ -170,6 +172,8 @@ class NavigationNode:
         if self._cloud is not None:
             self.unused[Unused.SUPERSEDED] += 1
         self._cloud = _Heard(info, body, self._wall_ns())
+        if self.hears_clouds is not None:
+            self.hears_clouds(body, info.encoding)
 
     def _hear_odometry(self, info: TopicInfo, body: bytes) -> None:
         said = hearing.read_odometry(body, info.encoding)
@@ -474,6 +478,10 @@ class NavigationNode:
         found = {reason.value: count for reason, count in self.unused.items()}
         found |= {f"step_{reason.value}": count for reason, count in self.navigator.unused.items() if count}
         return found | {f"cloud_{reason}": count for reason, count in self.navigator.scan_refusals.items()}
+
+    def say(self, name: str, type_name: str, body: bytes, stamp_ns: int) -> None:
+        """Publish a message of whoever works beside the node."""
+        self._say(name, type_name, body, stamp_ns)
 
     def _publish_map(self, name: str, type_name: str, body: bytes, stamp_ns: int) -> None:
         self._say(name, type_name, body, stamp_ns, latched=type_name == hearing.GRID)

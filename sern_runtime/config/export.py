@@ -6,6 +6,7 @@ A test compares the files in the tree with what this would write.
 """
 
 import json
+import math
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +18,7 @@ from sern_runtime.config.base import FileModel, Section
 from sern_runtime.config.client import ClientFile
 from sern_runtime.config.keys import PublicKeyFile, SecretKeyFile
 from sern_runtime.config.load import models_in
+from sern_runtime.config.navigation import NavigationFile
 from sern_runtime.config.relay import RelayFile
 
 DIALECT: Final = "https://json-schema.org/draft/2020-12/schema"
@@ -25,6 +27,7 @@ Json = dict[str, Any]
 _FILES: Final[tuple[tuple[str, str, type[FileModel]], ...]] = (
     ("Client file", "client.yaml", ClientFile),
     ("Relay file", "relay.yaml", RelayFile),
+    ("Navigation file", "navigation.yaml", NavigationFile),
     ("Public key file", "NAME.pub", PublicKeyFile),
     ("Secret key file", "NAME.key", SecretKeyFile),
 )
@@ -41,7 +44,7 @@ name, in the syntax of RE2 and in printable ASCII: like Python's, without look-a
 atomic groups, `{,3}` is written `{0,3}`, and a repeat goes up to 1000. Matching takes time linear in the length of a
 name. A pattern of more than 2048 steps (about one a character, times what repeats say) is refused, and so are more than
 4096 steps in all that a client subscribes to. The same models as JSON Schema: `schemas/client.schema.json`,
-`schemas/relay.schema.json`, `schemas/keys.schema.json`. Examples: `deploy/examples/`.
+`schemas/relay.schema.json`, `schemas/navigation.schema.json`, `schemas/keys.schema.json`. Examples: `deploy/examples/`.
 """
 
 
@@ -51,15 +54,32 @@ def schema_texts() -> dict[str, str]:
     return {
         "client.schema.json": _schema_text("client", ClientFile.model_json_schema()),
         "relay.schema.json": _schema_text("relay", RelayFile.model_json_schema()),
+        "navigation.schema.json": _schema_text("navigation", NavigationFile.model_json_schema()),
         "keys.schema.json": _schema_text("keys", keys.json_schema()),
     }
 
 
 def _schema_text(name: str, schema: Json) -> str:
     return (
-        json.dumps({"$schema": DIALECT, "$id": f"urn:sern:schema:{name}", **schema}, indent=2, ensure_ascii=False)
+        json.dumps(
+            _finite({"$schema": DIALECT, "$id": f"urn:sern:schema:{name}", **schema}),
+            indent=2,
+            ensure_ascii=False,
+            allow_nan=False,
+        )  # fmt: skip
         + "\n"
     )
+
+
+def _finite(value: Any) -> Any:
+    """Without keys whose value is infinite, which JSON has not: limits that are none unless a file sets them."""
+    if isinstance(value, dict):
+        return {key: _finite(each) for key, each in value.items() if not _infinite(each)}
+    return [_finite(each) for each in value] if isinstance(value, (list, tuple)) else value
+
+
+def _infinite(value: Any) -> bool:
+    return isinstance(value, float) and not math.isfinite(value)
 
 
 def reference_text() -> str:
@@ -99,6 +119,8 @@ def _prose(model: type[Section]) -> str:
 
 def _default(part: Json, definitions: Json) -> str:
     value = part.get("default")
+    if isinstance(value, list) and any(isinstance(each, dict) for each in value):
+        return "its defaults"
     if isinstance(value, dict) or ("$ref" in part and _resolved(part, definitions).get("type") == "object"):
         return "its defaults"
     return f"`{json.dumps(value, ensure_ascii=False)}`"
@@ -124,6 +146,8 @@ def _accepted(part: Json, definitions: Json) -> str:
     if "enum" in part:
         return ", ".join(f"`{word}`" for word in part["enum"])
     kind = part.get("type")
+    if kind == "array" and "prefixItems" in part:
+        return f"list of {len(part['prefixItems'])}: {_accepted(part['prefixItems'][0], definitions)}"
     if kind == "array":
         return f"list of {_accepted(part['items'], definitions)}"
     if kind in ("number", "integer"):

@@ -9,7 +9,8 @@ from collections.abc import Mapping
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, TypeVar, get_args, get_origin, get_type_hints
 
-from pydantic import Field, create_model, model_validator
+from pydantic import Field, GetJsonSchemaHandler, create_model, model_validator
+from pydantic_core import CoreSchema
 
 from sern_core.vocabulary.errors import UsageError
 from sern_runtime.config.base import Section, fault
@@ -35,6 +36,11 @@ class Mirror(Section):
         except UsageError as error:
             raise fault(str(error)) from error
         return self
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        """Its fields have their descriptions from the dataclass."""
+        return handler(core_schema)
 
     def made(self, **given: object) -> Any:
         """The options. `given`: what no file says. UsageError: they do not fit together."""

@@ -20,8 +20,26 @@ from sern_navigation.mppi import MppiOptions
 from sern_navigation.navigator import NavigatorOptions
 from sern_navigation.recovery import RecoveryOptions
 from sern_navigation.scan import ScanOptions
-from sern_runtime.config.base import FileModel, FileProblem, PathText, Seconds, Section, TopicText, fault, unexpected
-from sern_runtime.config.endpoints import DdsEndpoint, RclpyEndpoint, Ros1Endpoint, ZenohEndpoint, missing_directories
+from sern_runtime.config.base import (
+    FileModel,
+    FileProblem,
+    PathText,
+    Seconds,
+    Section,
+    TopicText,
+    fault,
+    resolve,
+    unexpected,
+)
+from sern_runtime.config.endpoints import (
+    DdsEndpoint,
+    RclpyEndpoint,
+    Ros1Endpoint,
+    ZenohEndpoint,
+    installing,
+    missing_directories,
+    missing_package,
+)
 from sern_runtime.config.load import Loaded, load
 from sern_runtime.config.mirrored import SectionOf, leave_out
 from sern_runtime.config.shared import HttpSection, LogSection
@@ -134,6 +152,35 @@ class LidarSection(Section):
     """Clouds of another frame are not used; null: of any."""
 
 
+class PerceptionSection(Section):
+    """What is in each cloud, for people and other nodes; the robot does not drive by it. Needs the extra `seg`."""
+
+    labels: TopicText = "/perception/points"
+    """The points with their classes: sensor_msgs/PointCloud2 with a field `label`, 0 where nothing is known."""
+    obstacles: TopicText = "/perception/obstacles"
+    """What stands in the way, whatever it is, as boxes with the class of most of its points:
+    visualization_msgs/MarkerArray."""
+    rate_hz: Annotated[float, Field(gt=0, le=20)] = 5.0
+    """Clouds a second that are looked at, at most."""
+    rings: Annotated[int, Field(ge=8, le=128)] = 16
+    """Rings of the scanner."""
+    columns: Annotated[int, Field(ge=64, le=4096)] = 900
+    """Points of a ring in one turn."""
+    low_deg: Annotated[float, Field(ge=-80, le=80)] = -15.0
+    """Elevation of its lowest ring."""
+    high_deg: Annotated[float, Field(ge=-80, le=80)] = 15.0
+    """Elevation of its highest ring. More than `low_deg`."""
+    model: PathText | None = None
+    """A network of your own (ONNX, as `python -m sern_perception.training train` makes it); null: the one that comes
+    with SERN."""
+
+    @model_validator(mode="after")
+    def _rises(self) -> "PerceptionSection":
+        if self.high_deg <= self.low_deg:
+            raise fault(f"{self.high_deg} is to be more than low_deg, {self.low_deg}", "high_deg")
+        return self
+
+
 class NavigationFile(FileModel):
     """A node that drives a robot to its goals by its own sensors, and asks the twin which way. The keys of Nav2's
     parts are called as there, and mean the same."""
@@ -198,6 +245,8 @@ class NavigationFile(FileModel):
     """What counts as an obstacle in a cloud."""
     mapping: SectionOf[MapperOptions] = Field(default_factory=SectionOf[MapperOptions])
     """With `localisation: scans`: how scans are matched and laid down."""
+    perception: PerceptionSection | None = None
+    """Classes of points, and boxes; null: there are none."""
     type_paths: tuple[PathText, ...] = ()
     """Directories with .action files, where nav2_msgs is of another distribution than what is installed here or what
     SERN ships (Jazzy's)."""
@@ -254,6 +303,13 @@ class NavigationFile(FileModel):
         for index, endpoint in enumerate(self.endpoints):
             yield from endpoint.file_problems(base_dir, ("endpoint", index) if several else ("endpoint",))
         yield from missing_directories(base_dir, self.type_paths, ("type_paths",))
+        perception = self.perception
+        if perception is not None and perception.model is not None:
+            path = resolve(base_dir, perception.model)
+            if not path.is_file():
+                yield FileProblem(("perception", "model"), f"{path}: no such file")
+        if perception is not None:
+            yield from missing_package("onnxruntime", installing("'sern[seg]'"), (), "perception")
 
 
 def load_navigation(path: Path, *, files: bool = True) -> Loaded[NavigationFile]:
