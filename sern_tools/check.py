@@ -107,9 +107,8 @@ def detect(document: Document) -> type[FileModel]:
     words = ("client", "endpoint", "relay", "sern_key")
     close = [word for key in data for word in difflib.get_close_matches(key, words, n=1)]
     hint = f" (did you mean {close[0]}?)" if close else ""
-    raise document.error(
-        (), "is no client file (client, relay, endpoint), relay file (relay), navigation file (grid) or key file" + hint
-    )
+    kinds = "client file (client, relay, endpoint), relay file (relay), navigation file (grid) or key file"
+    raise document.error((), f"is no {kinds}{hint}")
 
 
 def _lines(console: Console, lines: Iterable[str]) -> None:

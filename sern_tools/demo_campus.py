@@ -29,7 +29,10 @@ DITCH_DEPTH_M: Final = 0.8
 STREET_X_M: Final = 5.0
 STREET_HALF_M: Final = 1.6
 BRIDGE_X_M: Final = -15.0
-BRIDGE_HALF_M: Final = 0.8
+BRIDGE_HALF_M: Final = 1.1
+RAILING_HALF_M: Final = DITCH_HALF_M + 0.7
+RAILING_M: Final = 0.5
+"""The bridge has railings that begin before it, as bridges have."""
 START: Final = Pose2(-6.0, -10.0, 0.0)
 GOAL_M: Final = (-2.0, 9.0)
 CAR_M: Final = (4.2, 1.7, 1.4)
@@ -122,6 +125,13 @@ def campus(seed: int, dem: Path | None = None, streets: Path | None = None) -> C
             (BRIDGE_HALF_M, DITCH_HALF_M + 0.6, 0.03),
         )
     )  # fmt: skip
+    blocks += [
+        Block(
+            Label.OTHER, BRIDGE_X_M + side * BRIDGE_HALF_M, DITCH_Y_M, ground.height_m(BRIDGE_X_M, DITCH_Y_M - 2.0),
+            (0.04, RAILING_HALF_M, RAILING_M),
+        )
+        for side in (-1, 1)
+    ]  # fmt: skip
     length_m, width_m, height_m = CAR_M
     blocks.append(
         Block(

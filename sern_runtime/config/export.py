@@ -66,7 +66,7 @@ def _schema_text(name: str, schema: Json) -> str:
             indent=2,
             ensure_ascii=False,
             allow_nan=False,
-        )  # fmt: skip
+        )
         + "\n"
     )
 

@@ -134,8 +134,8 @@ def test_summary_names_what_matters(deployed: Path) -> None:
         ),
         (
             "relai: {}\n",
-            "f.yaml:1: is no client file (client, relay, endpoint), relay file (relay), navigation file (grid) or key file "
-            "(did you mean relay?)",
+            "f.yaml:1: is no client file (client, relay, endpoint), relay file (relay), navigation file (grid) or key "
+            "file (did you mean relay?)",
         ),
         ("relay: {name: hub, listen: []}\n", "f.yaml:1: relay.listen: is too short; at least 1 needed"),
         (
