@@ -10,12 +10,13 @@ PACKAGES := sern_core sern_runtime sern_relay sern_client sern_sim sern_twin ser
 # quarter less of CPU, and each worker of the tests would rewrite all of them anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup lint format types test wheel compiled test-compiled explore standstills lab bench performance endpoints figures cellular navigation picture demo demo-twin schemas clean
+.PHONY: help setup lint format types test wheel compiled test-compiled explore standstills lab bench performance endpoints figures cellular navigation picture demo demo-twin demo-navigation schemas clean
 
 help:
 	@echo "make setup    create $(VENV) with pinned dependencies"
 	@echo "make demo     relay, robot and site over a bad link, on this machine, next to plain ZMQ"
 	@echo "make demo-twin  a robot and its twin over a link that is gone for 30 s: how far off it was, and what it said"
+	@echo "make demo-navigation  a robot crosses a campus by its sensors, by its twin, by both; over a link that is gone on the way"
 	@echo "make test     the tests but the longer ones of make lab;  make lint, make types: static checks"
 	@echo "make wheel    a wheel in dist/ whose core is compiled;  make test-compiled: the tests of the core and of the daemons on it"
 	@echo "make compiled an environment with that wheel, .venv-compiled, also for benchmarks"
@@ -151,6 +152,12 @@ demo: setup
 
 demo-twin: setup
 	$(BIN)/sern demo-twin
+
+# DEM and STREETS: an elevation model and a map (.osm), whose ground and buildings are taken.
+DEM ?= $(wildcard ../shared/data/dem_1arcsec.tif)
+STREETS ?= $(wildcard ../shared/data/streets.osm)
+demo-navigation: setup
+	$(BIN)/sern demo-navigation --view 8090 $(DEM:%=--dem %) $(STREETS:%=--streets %)
 
 schemas: setup
 	$(BIN)/python -m sern_runtime.config.export schemas docs/configuration.md

@@ -13,12 +13,16 @@ from sern_core.topics.rules import Direction
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import ClientName, Encoding, PriorityClass, TopicName
 from sern_runtime.config.client import ClientFile, load_client
+from sern_runtime.config.navigation import load_navigation
 from sern_runtime.config.relay import load_relay
 from sern_runtime.config.twin import TwinEndpoint
 
 EXAMPLES: Final = Path(__file__).resolve().parents[2] / "deploy" / "examples"
-CLIENTS: Final = sorted(path.name for path in EXAMPLES.glob("*.yaml") if path.name != "relay.yaml")
+OF_THE_LINK: Final = sorted(path for path in EXAMPLES.glob("*.yaml") if path.name != "navigation.yaml")
+"""Those of relay and clients."""
+CLIENTS: Final = [path.name for path in OF_THE_LINK if path.name != "relay.yaml"]
 CONTROL, STATE, BULK = PriorityClass.CONTROL, PriorityClass.STATE, PriorityClass.BULK
+CLOUD: Final = "sensor_msgs/msg/PointCloud2"
 NOETIC: Final = ("jackal-noetic.yaml", "husky-noetic.yaml")
 
 
@@ -55,7 +59,7 @@ def test_is_accepted(name: str) -> None:
     assert model.http.listen is not None and model.http.listen.startswith("127.0.0.1:")
 
 
-@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.yaml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", OF_THE_LINK, ids=lambda path: path.stem)
 def test_it_adapts_and_never_thins_a_command(path: Path) -> None:
     """The ready-made files of relay, robots and sites are as docs/adaptation.md says."""
     relay = path.name == "relay.yaml"
@@ -151,6 +155,14 @@ def test_the_relay_lets_through_what_a_client_needs(name: str) -> None:
     assert not table.may_subscribe(own, TopicName("/other1/cmd_vel"))
 
 
+def test_the_navigation_hears_what_the_robot_has_and_drives_by_its_topic() -> None:
+    model = load_navigation(EXAMPLES / "navigation.yaml", files=False).model
+    robot = client("jackal-jazzy.yaml")
+    for topic, type_name in ((model.topics.cloud, CLOUD), (model.topics.odometry, "nav_msgs/msg/Odometry")):
+        assert robot.rules().find(type_name, TopicName(f"/j100_0000{topic}")) is not None, topic
+    assert model.options().scan.origin_m == (0.0, 0.0, 0.4) and model.topics.twin == "/twin/scene/map"
+
+
 def test_twins_are_made_of_what_the_robot_sends() -> None:
     (section,) = client("twin.yaml").endpoints
     assert isinstance(section, TwinEndpoint)
@@ -231,7 +243,7 @@ def test_each_site_takes_what_its_operator_drives_by_of_each_robot(site: str, ro
 
 def test_no_example_caps_a_command() -> None:
     """A limit on the rate makes a command wait for its turn, and does nothing to a reliable topic."""
-    for path in sorted(EXAMPLES.glob("*.yaml")):
+    for path in OF_THE_LINK:
         if path.stem.startswith("relay"):
             continue
         model = load_client(path, files=False).model

@@ -13,7 +13,8 @@ import pytest
 from tests.support import child
 
 UNITS: Final = Path(__file__).resolve().parents[2] / "deploy" / "systemd"
-NAMES: Final = ("sern-relay.service", "sern-client.service", "sern-client@.service", "sern-twin.service")
+NAMES: Final = ("sern-relay.service", "sern-client.service", "sern-client@.service", "sern-twin.service",
+                "sern-navigation.service")  # fmt: skip
 ONCE: Final = {
     ("Unit", "StartLimitIntervalSec"): "0",
     ("Service", "Type"): "notify",
@@ -107,6 +108,15 @@ def test_that_of_the_twins_is_the_client_with_another_program() -> None:
     expected = {"Description": "SERN twins", "ExecStart": "/opt/sern/bin/sern-twin --config /etc/sern/twin.yaml"}
     client = read("sern-client.service")
     assert read("sern-twin.service") == [(s, key, expected.get(key, value)) for s, key, value in client]
+
+
+def test_that_of_the_navigation_is_the_client_with_another_program() -> None:
+    expected = {
+        "Description": "SERN navigation",
+        "ExecStart": "/opt/sern/bin/sern-navigation --config /etc/sern/navigation.yaml",
+    }
+    client = read("sern-client.service")
+    assert read("sern-navigation.service") == [(s, key, expected.get(key, value)) for s, key, value in client]
 
 
 @pytest.mark.parametrize("name", NAMES)
