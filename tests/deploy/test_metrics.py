@@ -10,11 +10,18 @@ from pathlib import Path
 from typing import Any, Final
 
 import pytest
+from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 from ruamel.yaml import YAML
 
-from sern_core.vocabulary.types import DropReason
+from sern_client.navigation.metrics import register_navigation
+from sern_client.navigation.node import NavigationNode
+from sern_client.navigation.options import NodeOptions
+from sern_core.vocabulary.types import DropReason, Encoding
+from sern_runtime.metrics import Metrics
+from sern_twin.world.grid import Grid
 from tests.daemons import Lab, write_bag
+from tests.sern_client.navigation.graph import Graph
 
 DEPLOY: Final = Path(__file__).resolve().parents[2] / "deploy"
 OPERATIONS: Final = DEPLOY.parent / "docs" / "operations.md"
@@ -41,9 +48,18 @@ def expressions() -> list[str]:
     return [re.sub(r"\$\w+", ".*", text) for text in found]
 
 
+def navigation() -> str:
+    """What a node that navigates says of itself."""
+    registry = CollectorRegistry()
+    node = NavigationNode(NodeOptions(), Grid(0.0, 0.0, 0.1, 10, 10), Graph().endpoint, Encoding.CDR)
+    register_navigation(Metrics(registry), node)
+    return generate_latest(registry).decode()
+
+
 @pytest.fixture(scope="module")
 def metrics(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
-    """Sample name -> labels, of a relay with a robot and a site. A family without samples yet has the label `?`."""
+    """Sample name -> labels, of a relay with a robot and a site, of twins, and of a node that navigates. A family
+    without samples yet has the label `?`."""
 
     async def collect() -> list[str]:
         directory = tmp_path_factory.mktemp("metrics")
@@ -65,7 +81,7 @@ def metrics(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
             return [process.get("/metrics")[1] for process in (relay, site, robot, twin)]
 
     found: dict[str, set[str]] = {}
-    for text in asyncio.run(collect()):
+    for text in (*asyncio.run(collect()), navigation()):
         for family in text_string_to_metric_families(text):
             name = family.name + ("_total" if family.type == "counter" else "")
             found.setdefault(name, {"?"})
