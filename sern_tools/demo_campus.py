@@ -33,7 +33,7 @@ BRIDGE_HALF_M: Final = 1.1
 RAILING_HALF_M: Final = DITCH_HALF_M + 0.7
 RAILING_M: Final = 0.5
 """The bridge has railings that begin before it, as bridges have."""
-START: Final = Pose2(-6.0, -10.0, 0.0)
+START: Final = Pose2(8.0, -10.0, 0.0)
 GOAL_M: Final = (-2.0, 9.0)
 CAR_M: Final = (4.2, 1.7, 1.4)
 """Length, width and height of the car, which stands across the street."""
@@ -54,6 +54,13 @@ _MADE_UP: Final[tuple[Corners, ...]] = (
     ((3.0, 6.0), (14.0, 6.0), (14.0, 14.0), (3.0, 14.0)),
     ((-3.0, -18.0), (10.0, -18.0), (10.0, -12.0), (-3.0, -12.0)),
 )
+
+_YARD: Final[tuple[Corners, ...]] = (
+    ((-9.8, -5.6), (-4.0, -5.6), (-4.0, -5.3), (-9.8, -5.3)),
+    ((-9.8, -9.5), (-4.0, -9.5), (-4.0, -9.2), (-9.8, -9.2)),
+    ((-9.8, -9.5), (-9.5, -9.5), (-9.5, -5.3), (-9.8, -5.3)),
+)
+"""Walls of a yard that is open to the east: a dead end on the way along the ditch."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +116,7 @@ def campus(seed: int, dem: Path | None = None, streets: Path | None = None) -> C
     if streets is not None:
         buildings, plane = _of_map(streets)
         notes.append(f"{len(buildings)} buildings of {streets.name}")
+    buildings += _YARD
     heights = _with_ditch(heights)
     ground = Terrain(heights, half_size_m=HALF_M)
     blocks = [block for corners in buildings for block in _walls(ground, corners)]
@@ -219,6 +227,7 @@ def _of_map(path: Path) -> tuple[tuple[Corners, ...], TangentPlane]:
             shapely.box(-HALF_M, DITCH_Y_M - DITCH_HALF_M, HALF_M, DITCH_Y_M + DITCH_HALF_M).buffer(CLEAR_M),
             shapely.box(STREET_X_M - STREET_HALF_M, -10.0, STREET_X_M + STREET_HALF_M, 4.0).buffer(0.5),
             shapely.box(BRIDGE_X_M - CLEAR_M, -10.0, BRIDGE_X_M + CLEAR_M, 2.0),
+            shapely.box(-10.0, -11.5, -4.0, -5.0),
             shapely.Point(START.x_m, START.y_m).buffer(CLEAR_M), shapely.Point(*GOAL_M).buffer(CLEAR_M),
         ]
     )  # fmt: skip

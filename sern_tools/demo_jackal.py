@@ -8,6 +8,7 @@ truly is, how far it drove and what it touched is told over HTTP (/api/robot).
 
 import asyncio
 import time
+from collections.abc import Callable
 from math import cos, sin
 from pathlib import Path
 from random import Random
@@ -31,8 +32,9 @@ from sern_runtime.http import HttpServer
 from sern_runtime.http_routes import Health
 from sern_runtime.loop import Shutdown
 from sern_sim.mujoco_jackal import MujocoJackal
+from sern_sim.plant import Plant
 from sern_sim.robot import STEP_S
-from sern_tools.demo_campus import START, Campus, campus
+from sern_tools.demo_campus import START, campus
 
 COMMAND: Final = TopicName("/cmd_vel")
 TWIST: Final = "geometry_msgs/msg/Twist"
@@ -49,8 +51,9 @@ NOISE_M, NOISE_RAD = 0.01, 0.002
 class Robot:
     """`run` until cancelled."""
 
-    def __init__(self, place: Campus, seed: int, domain: int) -> None:
-        self.jackal = MujocoJackal(Random(seed), world=place.terrain, start=START)
+    def __init__(self, jackal: Plant, seed: int, domain: int, *, touches: Callable[[], bool] = lambda: False) -> None:
+        """`touches`: whether it touches anything now."""
+        self.jackal = jackal
         self.touched = 0
         self._noise = Random(seed + 1)
         self._endpoint = DdsEndpoint(
@@ -58,6 +61,7 @@ class Robot:
         )
         self._commanded_s = 0.0
         self._subscription: Subscription | None = None
+        self._touching = touches
         self._touches = False
         self._seq = 0
 
@@ -97,8 +101,9 @@ class Robot:
                     self.jackal.drive(0.0, 0.0)
                 while self.jackal.state.time_s + STEP_S <= at_s:
                     self.jackal.step()
-                    self.touched += self.jackal.touches and not self._touches
-                    self._touches = self.jackal.touches
+                    touches = self._touching()
+                    self.touched += touches and not self._touches
+                    self._touches = touches
                 stamp_ns = time.time_ns()
                 if at_s >= odometry_s:
                     odometry_s = max(odometry_s + ODOMETRY_S, at_s - ODOMETRY_S)
@@ -177,7 +182,8 @@ def command(
 
     async def run(shutdown: Shutdown) -> int:
         ros_types.load()
-        robot = Robot(campus(seed, dem, streets), seed, domain)
+        jackal = MujocoJackal(Random(seed), world=campus(seed, dem, streets).terrain, start=START)
+        robot = Robot(jackal, seed, domain, touches=lambda: jackal.touches)
 
         def works() -> Health:
             return Health(ok=True, reason="driving")
