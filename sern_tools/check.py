@@ -19,6 +19,7 @@ from sern_core.vocabulary.types import ClientName
 from sern_runtime.config import keys
 from sern_runtime.config.base import FileModel
 from sern_runtime.config.client import ClientFile
+from sern_runtime.config.endpoints import installing
 from sern_runtime.config.load import Checked, Loaded, check_document
 from sern_runtime.config.relay import RelayFile
 from sern_runtime.config.yaml import Document, read_document
@@ -96,8 +97,12 @@ def detect(document: Document) -> type[FileModel]:
             raise document.error(("sern_key",), f"is not accepted as it is; accepted: {', '.join(_KEY_FILES)}")
         return kind
     if "grid" in data and not data.keys() & {"client", "relay"}:
-        from sern_runtime.config.navigation import NavigationFile  # numpy and scipy, which others need not have
-
+        try:
+            from sern_runtime.config.navigation import NavigationFile
+        except ImportError as error:  # scipy, which others need not have
+            package = installing("'sern[twin]'")
+            problem = f"is a navigation file, and to read one needs more packages: {package} ({error})"
+            raise document.error((), problem) from None
         return NavigationFile
     # A client file has a section `relay` too: its connection to the relay.
     if "client" in data or "endpoint" in data:
@@ -126,6 +131,9 @@ def _summary(out: Console, loaded: Loaded[FileModel]) -> None:
         _lines(out, [f"public key file of {model.name}, {len(model.keys)} key(s)"])
     elif isinstance(model, keys.SecretKeyFile):
         _lines(out, [f"secret key file of {model.name}"])
+    elif "grid" in type(model).model_fields:
+        kinds = " and ".join(endpoint.kind for endpoint in model.endpoints)  # type: ignore[attr-defined]
+        _lines(out, [f"navigation at endpoint {kinds}"])
 
 
 def _table(*titles: str) -> Table:

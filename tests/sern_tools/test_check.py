@@ -426,3 +426,15 @@ def test_command_line_alone_and_inside_another(deployed: Path) -> None:
     assert runner.invoke(outer, ["check", str(deployed / "site.yaml")]).exit_code == 0
     result = runner.invoke(check.app, [str(deployed / "none.yaml")])
     assert (result.exit_code, result.stdout, result.stderr) == (2, "", f"{deployed}/none.yaml: no such file\n")
+
+
+def test_a_navigation_file_is_read_where_its_packages_are(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "navigation.yaml"
+    path.write_text("endpoint: {kind: ros1}\ngrid: {west_m: 0, south_m: 0, width_m: 4, length_m: 4}\n")
+    assert check.run_check(path) == check.EXIT_OK
+    assert "navigation at endpoint ros1" in capsys.readouterr().out
+    monkeypatch.setitem(sys.modules, "sern_runtime.config.navigation", None)
+    assert check.run_check(path) == check.EXIT_USER_ERROR
+    assert "to read one needs more packages" in capsys.readouterr().err
