@@ -11,6 +11,13 @@ from sern_perception.training.table import NONE, Study, Tried, interval, joined,
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 
+def test_the_document_has_the_table_of_the_file_beside_it() -> None:
+    """`python -m sern_perception.training study --table docs/perception-study.json` prints it."""
+    text = (DOCS / "perception.md").read_text()
+    between = text.partition("<!-- study begin -->\n")[2].partition("<!-- study end -->")[0]
+    assert between == table(read(DOCS / "perception-study.json")) + "\n"
+
+
 def ious(share: float) -> dict[str, float]:
     return {"ground": share + 0.1, "car": share - 0.1}
 
