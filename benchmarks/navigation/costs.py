@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from benchmarks.common import Report, percentile
+from benchmarks.link.figures import NEVER_S
 from benchmarks.navigation.campus import GRID, YARD, campus, cells_of
 from benchmarks.navigation.episode import POINTS
 from sern_navigation.costmap.costs import Costmap
@@ -136,10 +137,12 @@ def discrepancies(seeds: int, report: Report) -> None:
             late_s[kind] += times_s
         wrong, hours = wrong + flags, hours + driven_h
     for kind, times_s in late_s.items():
-        ordered = sorted(times_s)
-        report.row("where the twin is wrong", kind.value, counted_things=float(len(ordered)),
-                   median_s=percentile(ordered, 0.5), p95_s=percentile(ordered, 0.95))  # fmt: skip
-        report.reach(f"{kind}: told after it was first seen, p95, s", percentile(ordered, 0.95), 1.0)
+        ordered = sorted(min(time_s, NEVER_S) for time_s in times_s)
+        if ordered:
+            p95_s = percentile(ordered, 0.95)
+            report.row("where the twin is wrong", kind.value, counted_things=len(ordered),
+                       median_s=percentile(ordered, 0.5), p95_s=p95_s)  # fmt: skip
+            report.reach(f"{kind}: told after it was first seen, p95, s", p95_s, 1.0)
     report.row("where the twin is wrong", "told, and not so", flags_hour=wrong / hours, driven_hours=hours)
     report.reach("discrepancies that are none, an hour", wrong / hours, 1.0)
 
