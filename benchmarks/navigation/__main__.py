@@ -35,6 +35,7 @@ def bench(options: argparse.Namespace, report: Report) -> None:
         costs.cycle(report, 60 if options.quick else 400)
         costs.plans(report, 10 if options.quick else 100)
         costs.scans(report, 30 if options.quick else 200)
+        report.note("cycles, plans and scans in CPU time of one process")
 
 
 def part(text: str) -> str:

@@ -177,3 +177,14 @@ def test_a_way_goes_around_what_the_twin_says_and_through_it_if_there_is_no_othe
 def test_options_that_are_none_are_refused(change: dict[str, Any]) -> None:
     with pytest.raises(UsageError):
         PlannerOptions(**change)
+
+
+@pytest.mark.parametrize("twin_travel_multiplier", [0.0, 15.0, 1e4])
+def test_a_way_that_costs_much_more_than_its_length_is_found(twin_travel_multiplier: float) -> None:
+    """A robot in a room of which the twin says that all of it is taken: one step costs more than the first bound."""
+    layered = LayeredCostmap(GRID)
+    layered.static.take(GRID, empty_map(GRID))
+    layered.twin.take(TwinView(GRID, filled(GRID, (-3.0, -3.0, -1.0, 3.0), (0.0, -3.0, 3.0, 3.0)), 0.0))
+    options = PlannerOptions(twin_travel_multiplier=twin_travel_multiplier)
+    for goal_m in ((-0.1, 0.0), (2.5, 2.5)):
+        assert plan(layered.everywhere(0.0), (-0.5, 0.0), goal_m, options).found
