@@ -90,10 +90,13 @@ class Campus:
         return json.dumps({"type": "FeatureCollection", "features": features})
 
     def added(self) -> tuple[tuple[str, Pose2, tuple[float, float, float]], ...]:
-        """What people have added to the twin, by name: place and size [m]. The car stands there; the logs, at both ends
-        of the bridge, do not."""
-        ways = [(BRIDGE_X_M, DITCH_Y_M + side * (DITCH_HALF_M + 0.2)) for side in (-1, 1)]
-        logs = [("logs", Pose2(x_m, y_m, 0.0), (2 * LOG_M[0], LOG_M[1], LOG_M[1])) for x_m, y_m in ways]
+        """What people have added to the twin, by name: place and size [m]. The car stands there; the logs, side by side
+        before the bridge, do not."""
+        before_m = DITCH_Y_M - DITCH_HALF_M - 0.2
+        logs = [
+            ("logs", Pose2(BRIDGE_X_M + side * LOG_M[0] / 2, before_m, 0.0), (LOG_M[0], LOG_M[1], LOG_M[1]))
+            for side in (-1, 1)
+        ]
         return (("car", Pose2(STREET_X_M, DITCH_Y_M, 0.0), CAR_M), *logs)
 
     def _area(self, tags: dict[str, str], corners: Corners) -> Any:
