@@ -121,8 +121,8 @@ def contents(options: Options, mode: str, relay_port: int, web: dict[str, int], 
         }  # fmt: skip
     if mode == SERN:
         navigation["topics"]["twin"] = TWIN_MAP
-        # What the twin has is worth a detour of some twenty metres here, where a wrong way is longer than that.
-        navigation["planner"] = {"twin_travel_multiplier": 30.0}
+        # Unknown ground is dear as well: by default a wall of the twin is worth a detour of five metres over it.
+        navigation["planner"] = {"twin_travel_multiplier": 120.0}
         robot["scene"] = {**scene, "scanners": [scanner]}
     shared = ["/scene/.*"]
     return {
