@@ -9,7 +9,7 @@ from sern_client.actions import ACCEPT_S
 from sern_client.endpoints.base import Endpoint, Publisher
 from sern_client.endpoints.composite import CompositeEndpoint, with_services
 from sern_client.link_topics import LinkTopics
-from sern_client.sections import make_section
+from sern_client.sections import Resolve, make_section
 from sern_core.topics.patterns import compile_pattern
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding
@@ -24,20 +24,21 @@ _log = logging.getLogger(__name__)
 
 def make_endpoint(loaded: Loaded[ClientFile]) -> Endpoint:
     """The endpoint of a client: the one its file names, or several as one. Raises ConfigError."""
-    named = named_sections(loaded.model)
-    made = [make_section(section, loaded.resolve) for section in named]
-    endpoint = made[0]
-    if len(made) > 1:
-        elsewhere = services_elsewhere(named)
-        services_only = [
-            endpoint
-            for section, endpoint in zip(named, made, strict=True)
-            if isinstance(section, sections.RclpyEndpoint) and section.services_only
-        ]
-        endpoint = CompositeEndpoint(
-            made, no_services_of=[made[index] for index in elsewhere], no_topics_of=services_only
-        )
-    return _with_actions(loaded, endpoint)
+    return _with_actions(loaded, combined(named_sections(loaded.model), loaded.resolve))
+
+
+def combined(named: Sequence[sections.EndpointSection], resolve: Resolve, *, as_node: bool = False) -> Endpoint:
+    """The endpoints of some sections as one. `as_node` as in `make_section`. Raises ConfigError."""
+    made = [make_section(section, resolve, as_node=as_node) for section in named]
+    if len(made) == 1:
+        return made[0]
+    services_only = [
+        endpoint
+        for section, endpoint in zip(named, made, strict=True)
+        if isinstance(section, sections.RclpyEndpoint) and section.services_only
+    ]
+    elsewhere = [made[index] for index in services_elsewhere(named)]
+    return CompositeEndpoint(made, no_services_of=elsewhere, no_topics_of=services_only)
 
 
 def _with_actions(loaded: Loaded[ClientFile], endpoint: Endpoint) -> Endpoint:

@@ -30,7 +30,7 @@ _FINE_M: Final = 0.05
 _BEFORE_M: Final = 0.12
 """An edge is said to be so far before a hole that is sure: rays are a quarter of a metre apart where it matters."""
 _OVER: Final = np.float32(1e-3)
-"""So much steeper a ray is that passes over another."""
+"""A ray that passes over another is so much steeper."""
 _TURN: Final = 2 * math.pi
 _MOST_TILT_RAD: Final = 0.7
 _MOST_M: Final = 1e4

@@ -3,7 +3,7 @@
 from typing import Any, Final
 
 from sern_core.vocabulary.types import Encoding
-from sern_runtime import ros_types
+from sern_runtime import ros_geometry, ros_types
 from sern_twin.world.grid import Grid
 from sern_twin.world.map_updates import MapUpdate
 from sern_twin.world.patches import Cells
@@ -52,10 +52,7 @@ class MapWriter:
 
     def upright(self, x_m: float, y_m: float, z_m: float) -> Any:
         """A geometry_msgs/Pose that is not turned."""
-        encoding = self._encoding
-        point = ros_types.new("geometry_msgs/msg/Point", encoding, x=x_m, y=y_m, z=z_m)
-        turn = ros_types.new("geometry_msgs/msg/Quaternion", encoding, w=1.0)
-        return ros_types.new("geometry_msgs/msg/Pose", encoding, position=point, orientation=turn)
+        return ros_geometry.pose(self._encoding, x_m, y_m, z_m)
 
     def header(self, stamp_ns: int) -> Any:
         """A std_msgs/Header of the next message; a ROS 1 header counts them."""

@@ -46,7 +46,7 @@ LEAST_M2: Final = 4.0
 CLEAR_M: Final = 2.0
 """No building stands nearer to ditch, street, start and goal."""
 MAP_MIDDLE_M: Final = (42.0, -9.0)
-"""Where the middle of the place lies on the map: east and north of the middle of what the map has."""
+"""The middle of the place on the map: east and north of the middle of what the map has."""
 Corners = tuple[tuple[float, float], ...]
 GRID: Final = Grid(-HALF_M, -HALF_M, 0.1, 400, 400, frame_id="odom")
 _MADE_UP: Final[tuple[Corners, ...]] = (

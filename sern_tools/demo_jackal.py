@@ -9,7 +9,6 @@ truly is, how far it drove and what it touched is told over HTTP (/api/robot).
 import asyncio
 import time
 from collections.abc import Callable
-from math import cos, sin
 from pathlib import Path
 from random import Random
 from typing import Annotated, Final
@@ -25,7 +24,7 @@ from sern_client.endpoints.twin.bodies import ODOMETRY, read_message
 from sern_core.vocabulary.errors import BodyError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding, TopicName
-from sern_runtime import clock, ros_types
+from sern_runtime import clock, ros_geometry, ros_types
 from sern_runtime.config.shared import LogSection
 from sern_runtime.entry import run_daemon, serve
 from sern_runtime.http import HttpServer
@@ -43,7 +42,7 @@ POINTS: Final = 16 * 450
 CLOUD_S: Final = 0.1
 ODOMETRY_S: Final = 0.04
 STANDS_S: Final = 0.5
-"""Without a command for so long it stands, as the base of a Jackal does."""
+"""It stands without a command for so long, as the base of a Jackal does."""
 NOISE_M, NOISE_RAD = 0.01, 0.002
 """What its localisation is off in each axis, one sigma."""
 
@@ -123,14 +122,9 @@ class Robot:
     def _odometry(self, stamp_ns: int) -> bytes:
         state, gauss = self.jackal.state, self._noise.gauss
         new = ros_types.new
-        pose = new(
-            "geometry_msgs/msg/Pose",
-            Encoding.CDR,
-            position=new(
-                "geometry_msgs/msg/Point", Encoding.CDR,
-                x=state.pose.x_m + gauss(0, NOISE_M), y=state.pose.y_m + gauss(0, NOISE_M), z=state.z_m,
-            ),
-            orientation=turned(state.roll_rad, state.pitch_rad, state.pose.yaw_rad + gauss(0, NOISE_RAD)),
+        pose = ros_geometry.pose(
+            Encoding.CDR, state.pose.x_m + gauss(0, NOISE_M), state.pose.y_m + gauss(0, NOISE_M), state.z_m,
+            state.pose.yaw_rad + gauss(0, NOISE_RAD), state.roll_rad, state.pitch_rad,
         )  # fmt: skip
         twist = new(
             "geometry_msgs/msg/Twist",
@@ -156,19 +150,6 @@ class Robot:
             "touched": self.touched,
             "time_s": state.time_s,
         }
-
-
-def turned(roll_rad: float, pitch_rad: float, yaw_rad: float) -> object:
-    """Yaw, then pitch, then roll, about the axes as turned before (REP 103)."""
-    (sr, cr), (sp, cp), (sy, cy) = ((sin(each / 2), cos(each / 2)) for each in (roll_rad, pitch_rad, yaw_rad))
-    return ros_types.new(
-        "geometry_msgs/msg/Quaternion",
-        Encoding.CDR,
-        x=sr * cp * cy - cr * sp * sy,
-        y=cr * sp * cy + sr * cp * sy,
-        z=cr * cp * sy - sr * sp * cy,
-        w=cr * cp * cy + sr * sp * sy,
-    )
 
 
 def command(

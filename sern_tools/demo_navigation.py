@@ -21,15 +21,12 @@ import aiohttp
 import typer
 from rich.console import Console
 
-from sern_core.vocabulary.errors import ConfigError, SernError
+from sern_core.vocabulary.errors import ConfigError
+from sern_runtime.config.endpoints import installing
 from sern_runtime.profiles import load_profile
 from sern_sim.profiles import LinkProfile
 from sern_tools import demo_navigation_report as reporting
 from sern_tools.demo import (
-    EXIT_BROKEN,
-    EXIT_ERROR,
-    EXIT_INTERRUPTED,
-    EXIT_OK,
     START_S,
     cancelled_by_signals,
     get_json,
@@ -37,6 +34,7 @@ from sern_tools.demo import (
     working_directory,
 )
 from sern_tools.demo_link import LinkProcess
+from sern_tools.demo_promises import conclude
 from sern_tools.demo_scenario import FAR_HOST, HOST
 from sern_tools.harness.files import Content, client_content, relay_content, write
 from sern_tools.harness.processes import Children, program, python
@@ -303,8 +301,8 @@ def demo_navigation(
     Needs the extras twin, geo, sim and dds. Exit status: 0 every promise kept, 1 one was broken, 2 it could not run,
     130 interrupted.
     """
-    console = Console()
-    try:
+
+    async def driven(console: Console) -> reporting.NavigationReport:
         if mode is not None and mode not in MODES:
             raise ConfigError(f"--mode {mode!r} is none of {', '.join(map(repr, MODES))}")
         options = Options(
@@ -319,22 +317,9 @@ def demo_navigation(
             view_port=view,
             command=shlex.join(["sern", *sys.argv[1:]]),
         )
-        report = asyncio.run(run(options, console))
-        reporting.show(report, console)
-        for path in reporting.write(report, out):
-            console.print(f"wrote {path}", highlight=False, soft_wrap=True)
-        code = EXIT_OK if report.ok else EXIT_BROKEN
-    except ImportError as error:
-        from sern_runtime.config.endpoints import installing
+        return await run(options, console)
 
-        package = installing("'sern[twin,geo,sim,dds]'")
-        text = f"sern demo-navigation: needs more packages: {package} ({error})"
-        Console(stderr=True).print(text, highlight=False, markup=False, soft_wrap=True)
-        code = EXIT_ERROR
-    except (SernError, OSError) as error:
-        Console(stderr=True).print(f"sern demo-navigation: {error}", highlight=False, markup=False, soft_wrap=True)
-        code = EXIT_ERROR
-    except (asyncio.CancelledError, KeyboardInterrupt):
-        console.print("interrupted; everything was stopped")
-        code = EXIT_INTERRUPTED
-    raise typer.Exit(code)
+    conclude(
+        "sern demo-navigation", driven, reporting.show, lambda report: reporting.write(report, out),
+        packages=installing("'sern[twin,geo,sim,dds]'"),
+    )  # fmt: skip

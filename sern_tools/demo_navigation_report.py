@@ -1,12 +1,10 @@
 """What `sern demo-navigation` found: how each of the three ways went, the promises judged, and a picture from above."""
 
-import base64
 import html
 import io
-import json
 import math
 from dataclasses import dataclass
-from importlib.util import find_spec
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -14,19 +12,21 @@ from rich.console import Console
 from rich.table import Table
 
 from sern_core.vocabulary.errors import SernError
+from sern_tools import demo_promises
+from sern_tools.demo_promises import Verdict
 
 if TYPE_CHECKING:
     from sern_tools.demo_campus import Campus
 
 SUCCEEDED: Final = "succeeded"
 NEAR_M: Final = 0.6
-"""So near the goal the robot truly is when it says that it is there: its tolerance, its size and what it is off."""
+"""The robot truly is so near the goal when it says that it is there: its tolerance, its size and what it is off."""
 COLOURS: Final = {"Real Only": "#bc4c00", "Sim Only": "#8250df", "SERN": "#1a7f37"}
 DPI: Final = 130
 
 
 class Place(NamedTuple):
-    """Where the robot truly was, and what it was doing."""
+    """The true place of the robot, and what it was doing."""
 
     at_s: float
     x_m: float
@@ -63,13 +63,6 @@ class Drive:
     def words(self) -> str:
         why = f" ({self.ended.why})" if self.ended.why else ""
         return f"{self.ended.how}{why} after {self.took_s:.0f} s and {self.travelled_m:.0f} m"
-
-
-class Verdict(NamedTuple):
-    name: str
-    found: str
-    wanted: str
-    kept: bool
 
 
 @dataclass(frozen=True)
@@ -129,23 +122,12 @@ def show(report: NavigationReport, console: Console) -> None:
             str(each.touched), str(len(each.flagged)),
         )  # fmt: skip
     console.print(ways)
-    table = Table("promise", "found", "wanted", "")
-    for verdict in report.verdicts:
-        table.add_row(verdict.name, verdict.found, verdict.wanted, "kept" if verdict.kept else "[red]BROKEN")
-    console.print(table)
+    demo_promises.show(report.verdicts, console)
 
 
 def write(report: NavigationReport, out: Path) -> list[Path]:
     """JSON, and a page with the picture where matplotlib is."""
-    out.mkdir(parents=True, exist_ok=True)
-    result, page, picture = out / "navigation.json", out / "navigation.html", out / "navigation.png"
-    result.write_text(json.dumps(as_json(report), indent=1) + "\n", encoding="utf-8")
-    plotted = plot(report) if find_spec("matplotlib") is not None else None
-    page.write_text(as_html(report, plotted), encoding="utf-8")
-    if plotted is None:
-        return [result, page]
-    picture.write_bytes(plotted)
-    return [result, page, picture]
+    return demo_promises.write(out, "navigation", as_json(report), partial(plot, report), partial(as_html, report))
 
 
 def as_json(report: NavigationReport) -> dict[str, Any]:
@@ -172,26 +154,11 @@ def as_json(report: NavigationReport) -> dict[str, Any]:
 
 
 def as_html(report: NavigationReport, plotted: bytes | None) -> str:
-    rows = "".join(
-        f"<tr class='{'kept' if verdict.kept else 'broken'}'><td>{html.escape(verdict.name)}</td>"
-        f"<td>{html.escape(verdict.found)}</td><td>{html.escape(verdict.wanted)}</td>"
-        f"<td>{'kept' if verdict.kept else 'broken'}</td></tr>"
-        for verdict in report.verdicts
-    )
     ways = "".join(f"<li><b>{html.escape(each.mode)}</b>: {html.escape(each.words)}</li>" for each in report.drives)
-    picture = (
-        "<p>No picture: matplotlib is not installed.</p>"
-        if plotted is None
-        else f"<img alt='the ways from above' src='data:image/png;base64,{base64.b64encode(plotted).decode()}'>"
-    )
-    return (
-        "<!doctype html><html lang='en'><meta charset='utf-8'><title>Three ways across a campus</title><style>"
-        "body{font:15px system-ui,sans-serif;max-width:62em;margin:2em auto;padding:0 1em}img{max-width:100%}"
-        "td,th{padding:.25em .8em;text-align:left;border-bottom:1px solid #ddd}.broken td:last-child{color:#c00;"
-        "font-weight:bold}.kept td:last-child{color:#1a7f37}</style><h1>Three ways across a campus</h1>"
-        f"<p><code>{html.escape(report.command)}</code></p><ul>{ways}</ul>"
-        f"<table><tr><th>promise<th>found<th>wanted<th></tr>{rows}</table>{picture}</html>\n"
-    )
+    return demo_promises.page(
+        "Three ways across a campus", report.command, report.verdicts, plotted, shows="the ways from above",
+        more=f"<ul>{ways}</ul>",
+    )  # fmt: skip
 
 
 def plot(report: NavigationReport) -> bytes:

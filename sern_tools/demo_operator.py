@@ -1,7 +1,6 @@
 """The operator of `sern demo-navigation`, a node of the site's ROS 2 graph: adds to the twin, and gives the goal."""
 
 import asyncio
-import math
 import secrets
 import time
 from dataclasses import replace
@@ -18,7 +17,7 @@ from sern_client.navigation.action import ACTION, Types
 from sern_core.vocabulary.errors import ServiceError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding, TopicName
-from sern_runtime import ros_types
+from sern_runtime import ros_geometry, ros_types
 from sern_sim.robot import Pose2
 from sern_tools.demo_navigation_report import Ended
 
@@ -79,12 +78,7 @@ class Operator:
         """Add a box to the twin, as rviz or a script would."""
         assert self._markers is not None
         new, cdr, now_ns = ros_types.new, Encoding.CDR, time.time_ns()
-        half = place.yaw_rad / 2
-        pose = new(
-            "geometry_msgs/msg/Pose", cdr,
-            position=new("geometry_msgs/msg/Point", cdr, x=place.x_m, y=place.y_m),
-            orientation=new("geometry_msgs/msg/Quaternion", cdr, z=math.sin(half), w=math.cos(half)),
-        )  # fmt: skip
+        pose = ros_geometry.pose(cdr, place.x_m, place.y_m, yaw_rad=place.yaw_rad)
         self._added += 1
         marker = new(
             MARKER, cdr, header=ros_types.header(now_ns, FRAME, cdr), ns=name, id=self._added, type=_CUBE, action=_ADD,

@@ -20,16 +20,11 @@ import aiohttp
 import typer
 from rich.console import Console
 
-from sern_core.vocabulary.errors import SernError
 from sern_runtime.profiles import load_profile
 from sern_sim.profiles import LinkProfile
 from sern_sim.robot import Pose2
 from sern_tools import demo_twin_report as reporting
 from sern_tools.demo import (
-    EXIT_BROKEN,
-    EXIT_ERROR,
-    EXIT_INTERRUPTED,
-    EXIT_OK,
     START_S,
     cancelled_by_signals,
     get_json,
@@ -37,6 +32,7 @@ from sern_tools.demo import (
     working_directory,
 )
 from sern_tools.demo_link import LinkProcess
+from sern_tools.demo_promises import conclude
 from sern_tools.demo_scenario import FAR_HOST, HOST
 from sern_tools.demo_twin_report import Sample, TwinReport, judged
 from sern_tools.harness.files import Content, client_content, relay_content, write
@@ -234,8 +230,8 @@ def demo_twin(
 
     Exit status: 0 every promise kept, 1 one was broken, 2 it could not run, 130 interrupted.
     """
-    console = Console()
-    try:
+
+    async def measured(console: Console) -> TwinReport:
         link = load_profile(profile, profiles)
         options = Options(
             profile=link,
@@ -248,15 +244,6 @@ def demo_twin(
             view_port=view,
             command=shlex.join(["sern", *sys.argv[1:]]),
         )
-        report = asyncio.run(run(options, console))
-        reporting.show(report, console)
-        for path in reporting.write(report, out):
-            console.print(f"wrote {path}", highlight=False, soft_wrap=True)
-        code = EXIT_OK if report.ok else EXIT_BROKEN
-    except (SernError, OSError) as error:
-        Console(stderr=True).print(f"sern demo-twin: {error}", highlight=False, markup=False, soft_wrap=True)
-        code = EXIT_ERROR
-    except (asyncio.CancelledError, KeyboardInterrupt):
-        console.print("interrupted; everything was stopped")
-        code = EXIT_INTERRUPTED
-    raise typer.Exit(code)
+        return await run(options, console)
+
+    conclude("sern demo-twin", measured, reporting.show, lambda report: reporting.write(report, out))

@@ -1,21 +1,19 @@
 """What `sern demo-twin` found: the promises of the twin judged, as a table, a page with plots, and JSON."""
 
-import base64
-import html
 import io
-import json
 import math
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from rich.console import Console
-from rich.table import Table
 
 from sern_core.vocabulary.errors import SernError
+from sern_tools import demo_promises
+from sern_tools.demo_promises import Verdict
 
 STEADY_M: Final = 0.05
 RETURN_MEDIAN_M: Final = 0.05
@@ -61,13 +59,6 @@ class Sample(NamedTuple):
     @property
     def off_deg(self) -> float:
         return abs(math.degrees(math.remainder(self.truth[2] - self.shown[2], math.tau)))
-
-
-class Verdict(NamedTuple):
-    name: str
-    found: str
-    wanted: str
-    kept: bool
 
 
 @dataclass(frozen=True)
@@ -178,27 +169,14 @@ def _cm(metres: float) -> str:
 
 
 def show(report: TwinReport, console: Console) -> None:
-    table = Table("promise", "found", "wanted", "")
-    for verdict in report.verdicts:
-        table.add_row(verdict.name, verdict.found, verdict.wanted, "kept" if verdict.kept else "[red]BROKEN")
-    console.print(table)
+    demo_promises.show(report.verdicts, console)
     worst_m = max(report.unhelped_m)
     console.print(f"what was heard last was up to {worst_m:.2f} m from the robot", highlight=False)
 
 
 def write(report: TwinReport, out: Path) -> list[Path]:
     """JSON, and a page with plots where matplotlib is."""
-    out.mkdir(parents=True, exist_ok=True)
-    result = out / "twin.json"
-    result.write_text(json.dumps(as_json(report), indent=1) + "\n", encoding="utf-8")
-    page = out / "twin.html"
-    picture = out / "twin.png"
-    plotted = plots(report) if find_spec("matplotlib") is not None else None
-    page.write_text(as_html(report, plotted), encoding="utf-8")
-    if plotted is None:
-        return [result, page]
-    picture.write_bytes(plotted)
-    return [result, page, picture]
+    return demo_promises.write(out, "twin", as_json(report), partial(plots, report), partial(as_html, report))
 
 
 def as_json(report: TwinReport) -> dict[str, Any]:
@@ -214,24 +192,8 @@ def as_json(report: TwinReport) -> dict[str, Any]:
 
 
 def as_html(report: TwinReport, plotted: bytes | None) -> str:
-    rows = "".join(
-        f"<tr class='{'kept' if verdict.kept else 'broken'}'><td>{html.escape(verdict.name)}</td>"
-        f"<td>{html.escape(verdict.found)}</td><td>{html.escape(verdict.wanted)}</td>"
-        f"<td>{'kept' if verdict.kept else 'broken'}</td></tr>"
-        for verdict in report.verdicts
-    )
-    picture = (
-        "<p>No plots: matplotlib is not installed.</p>"
-        if plotted is None
-        else f"<img alt='error, bound and way' src='data:image/png;base64,{base64.b64encode(plotted).decode()}'>"
-    )
-    return (
-        "<!doctype html><html lang='en'><meta charset='utf-8'><title>The twin through a blackout</title><style>"
-        "body{font:15px system-ui,sans-serif;max-width:62em;margin:2em auto;padding:0 1em}img{max-width:100%}"
-        "td,th{padding:.25em .8em;text-align:left;border-bottom:1px solid #ddd}.broken td:last-child{color:#c00;"
-        "font-weight:bold}.kept td:last-child{color:#1a7f37}</style><h1>The twin through a blackout</h1>"
-        f"<p><code>{html.escape(report.command)}</code></p><table><tr><th>promise<th>found<th>wanted<th></tr>{rows}"
-        f"</table>{picture}</html>\n"
+    return demo_promises.page(
+        "The twin through a blackout", report.command, report.verdicts, plotted, shows="error, bound and way"
     )
 
 

@@ -4,6 +4,7 @@ A port that is free now may be taken by the time that its owner listens. Who loo
 abstract socket of its name, which every process of this network namespace sees and which ends with its process.
 """
 
+import atexit
 import random
 import socket
 from collections import deque
@@ -63,6 +64,9 @@ def release_claims() -> None:
     for claims in _claims.values():
         while claims:
             claims.popleft().close()
+
+
+atexit.register(release_claims)
 
 
 def free_ports(count: int) -> list[int]:

@@ -135,7 +135,7 @@ class _Things:
         self._first(DiscrepancyKind.UNKNOWN_OBSTACLE, cells >= OCCUPIED, time_s, self._right_s)
 
     def late_s(self) -> dict[DiscrepancyKind, list[float]]:
-        """Of those that were seen."""
+        """The things that were seen."""
         found: dict[DiscrepancyKind, list[float]] = {kind: [] for kind in DiscrepancyKind}
         for key, seen_s in self._seen_s.items():
             found[key[0]].append(self._right_s.get(key, np.inf) - seen_s)

@@ -33,7 +33,7 @@ REAL: Final = ScanOptions(
 """The scanner of the recorded scans: 32 rings, 2 m above ground that its lowest rings see fall by 8 % ahead."""
 REAL_PITCH_RAD: Final = -0.08
 B_ON_A: Final[Pose] = (-0.487, -0.127, 0.0122)
-"""Where the second was taken, as those who recorded them state it."""
+"""The place of the second scan, as those who recorded them state it."""
 S_2D_MS: Final = 5.0
 MAPPED_MS: Final = 20.0
 _OCCUPIED_PERCENT: Final = 65
@@ -53,7 +53,7 @@ def costs(report: Report, count: int) -> None:
 
 
 def accuracy(report: Report, predictions: int, drives: int) -> None:
-    """Where the second real scan was taken by the map of the first, from predictions up to 0.25 m and 0.15 rad off; and
+    """The place of the second real scan on the map of the first, from predictions up to 0.25 m and 0.15 rad off; and
     drives of `DRIVE_S` with wheel odometry alone."""
     if not recordings.absent():
         off_m, off_deg = _second_scan(predictions)
@@ -159,7 +159,7 @@ def _second_scan(predictions: int) -> tuple[list[float], list[float]]:
 
 
 def _real_clouds() -> list[Cloud]:
-    """In the frame of the ground below the scanner."""
+    """Points in the frame of the ground below the scanner."""
     made = []
     for points in recordings.scans():
         places: NDArray[np.float32] = points[:, :3] + np.array([0.0, 0.0, REAL.origin_m[2]], np.float32)

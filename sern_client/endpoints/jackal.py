@@ -42,7 +42,7 @@ import numpy as np
 from sern_client.endpoints.clouds import CLOUD_TYPE, CloudSource, cloud_body
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.types import Encoding
-from sern_runtime import ros_types
+from sern_runtime import ros_geometry, ros_types
 from sern_sim.follower import ON_HILLS, Reference
 from sern_sim.pilot import OFF_M, FigureOfEight, Pilot
 from sern_sim.plant import Plant
@@ -238,29 +238,15 @@ class JackalSource:
     def _vector(self, x: float = 0.0, y: float = 0.0, z: float = 0.0, kind: str = "Vector3") -> Any:
         return self._new(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
 
-    def _turned(self, yaw_rad: float, roll_rad: float = 0.0, pitch_rad: float = 0.0) -> Any:
-        """Yaw, then pitch, then roll about the axes as turned before: a quaternion (REP 103)."""
-        (cos_y, sin_y), (cos_p, sin_p), (cos_r, sin_r) = (
-            (math.cos(angle / 2), math.sin(angle / 2)) for angle in (yaw_rad, pitch_rad, roll_rad)
-        )
-        return self._new(
-            "geometry_msgs/msg/Quaternion",
-            x=sin_r * cos_p * cos_y - cos_r * sin_p * sin_y,
-            y=cos_r * sin_p * cos_y + sin_r * cos_p * sin_y,
-            z=cos_r * cos_p * sin_y - sin_r * sin_p * cos_y,
-            w=cos_r * cos_p * cos_y + sin_r * sin_p * sin_y,
-        )
-
     def _pose_of(self, pose: Pose2) -> Any:
-        position = self._vector(pose.x_m, pose.y_m, kind="Point")
-        return self._new("geometry_msgs/msg/Pose", position=position, orientation=self._turned(pose.yaw_rad))
+        return ros_geometry.pose(self._encoding, pose.x_m, pose.y_m, yaw_rad=pose.yaw_rad)
 
     def _pose_on_ground(self, pose: Pose2) -> Any:
         """With the height and the tilt that the robot has now."""
         state = self.robot.state
-        position = self._vector(pose.x_m, pose.y_m, state.z_m, kind="Point")
-        orientation = self._turned(pose.yaw_rad, state.roll_rad, state.pitch_rad)
-        return self._new("geometry_msgs/msg/Pose", position=position, orientation=orientation)
+        return ros_geometry.pose(
+            self._encoding, pose.x_m, pose.y_m, state.z_m, pose.yaw_rad, state.roll_rad, state.pitch_rad
+        )
 
     def _twist(self, speed_mps: float, yaw_rate_radps: float) -> Any:
         return self._new(
@@ -275,7 +261,7 @@ class JackalSource:
         transform = self._new(
             "geometry_msgs/msg/Transform",
             translation=self._vector(pose.x_m, pose.y_m, z_m),
-            rotation=self._turned(pose.yaw_rad),
+            rotation=ros_geometry.quaternion(self._encoding, pose.yaw_rad),
         )
         header = self._header(stamp_ns, parent)
         name = "geometry_msgs/msg/TransformStamped"
@@ -311,7 +297,7 @@ class JackalSource:
         return self._new(
             "sensor_msgs/msg/Imu",
             header=self._header(stamp_ns, "imu_link", seq),
-            orientation=self._turned(state.pose.yaw_rad, state.roll_rad, state.pitch_rad),
+            orientation=ros_geometry.quaternion(self._encoding, state.pose.yaw_rad, state.roll_rad, state.pitch_rad),
             angular_velocity=self._vector(felt.roll_radps, felt.pitch_radps, felt.yaw_radps),
             angular_velocity_covariance=np.diag([GYRO_NOISE_RADPS**2] * 3).reshape(-1),
             linear_acceleration=self._vector(felt.forward_mps2, felt.left_mps2, felt.up_mps2),
@@ -321,7 +307,9 @@ class JackalSource:
         del seq
         state = self.robot.state
         moved = self._transform(stamp_ns, "base_link", self._where()[0], state.z_m, parent="odom")
-        moved.transform.rotation = self._turned(self._where()[0].yaw_rad, state.roll_rad, state.pitch_rad)
+        moved.transform.rotation = ros_geometry.quaternion(
+            self._encoding, self._where()[0].yaw_rad, state.roll_rad, state.pitch_rad
+        )
         return self._new("tf2_msgs/msg/TFMessage", transforms=[moved])
 
     def _tf_static(self, stamp_ns: int, seq: int) -> Any:

@@ -10,17 +10,16 @@ from prometheus_client import CollectorRegistry
 
 from sern_client.action_conversion.endpoint import ActionEndpoint, Rule
 from sern_client.endpoints.base import Endpoint, ServiceEndpoint
-from sern_client.endpoints.composite import CompositeEndpoint, with_services
-from sern_client.factory import services_elsewhere
+from sern_client.endpoints.composite import with_services
+from sern_client.factory import combined
 from sern_client.navigation.action import NavigateToPose, Types
 from sern_client.navigation.metrics import register_navigation
 from sern_client.navigation.node import NavigationNode
 from sern_client.navigation.options import Localisation, Mount, NodeOptions, OnLinkLoss, Stamps, TopicNames
-from sern_client.sections import make_section
 from sern_core.topics.patterns import compile_pattern
 from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_types
-from sern_runtime.config.endpoints import EndpointSection, RclpyEndpoint
+from sern_runtime.config.endpoints import EndpointSection
 from sern_runtime.config.load import Loaded
 from sern_runtime.config.navigation import NavigationFile, load_navigation
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
@@ -69,7 +68,7 @@ class NavigationDaemon:
         model = loaded.model
         self.encoding = Encoding.ROS1 if model.endpoints[0].kind == "ros1" else Encoding.CDR
         self.endpoint = self._make_endpoint()
-        self.node = NavigationNode(node_options(model), model.grid.grid, self.endpoint, self.encoding, parts=self.parts)
+        self.node = NavigationNode(node_options(model), model.grid.grid, self.endpoint, self.encoding)
         self.perception = self._make_perception()
         if self.perception is not None:
             self.node.hears_clouds = self.perception.heard
@@ -80,19 +79,7 @@ class NavigationDaemon:
     def _make_endpoint(self) -> Endpoint:
         model = self.loaded.model
         named = [_named(section) for section in model.endpoints]
-        made = [make_section(section, self.loaded.resolve, as_node=True) for section in named]
-        if len(made) == 1:
-            endpoint = made[0]
-        else:
-            elsewhere = services_elsewhere(named)
-            services_only = [
-                each
-                for section, each in zip(named, made, strict=True)
-                if isinstance(section, RclpyEndpoint) and section.services_only
-            ]
-            endpoint = CompositeEndpoint(
-                made, no_services_of=[made[index] for index in elsewhere], no_topics_of=services_only
-            )
+        endpoint = combined(named, self.loaded.resolve, as_node=True)
         services = with_services(endpoint)
         if self.encoding is Encoding.CDR or services is None:
             return endpoint
@@ -172,7 +159,7 @@ class NavigationDaemon:
 
         registry = CollectorRegistry()
         metrics = Metrics(registry)
-        register_navigation(metrics, self.node)
+        register_navigation(metrics, self.node, self.perception)
         self.errors.register(metrics)
         self.parts.register(metrics)
         return HttpServer(

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from sern_core.summaries.clouds import read_cloud
 from sern_core.vocabulary.errors import BodyError, UsageError
 from sern_core.vocabulary.types import Encoding
 from sern_navigation.navigator import Goal
+from sern_runtime.ros_geometry import angles_rad
 from sern_twin.world.grid import Floats, Grid
 from sern_twin.world.occupancy import Pose
 from sern_twin.world.patches import Cells
@@ -70,7 +71,7 @@ def read_odometry(body: bytes, encoding: Encoding) -> HeardOdometry:
     """A nav_msgs/Odometry. BodyError: it is none, or its orientation has no length."""
     message = read_message(body, ODOMETRY, encoding)
     place, twist = message.pose.pose.position, message.twist.twist
-    roll_rad, pitch_rad, yaw_rad = _angles(message.pose.pose.orientation)
+    roll_rad, pitch_rad, yaw_rad = angles_rad(message.pose.pose.orientation)
     return HeardOdometry(
         stamp_of(message.header.stamp),
         message.header.frame_id,
@@ -117,12 +118,12 @@ def read_goal(body: bytes, encoding: Encoding) -> Goal:
     return goal_of(read_message(body, GOAL, encoding))
 
 
-def goal_of(message: object) -> Goal:
+def goal_of(message: Any) -> Goal:
     """The goal of a PoseStamped. An orientation of all zeros looks no way in particular."""
-    pose, header = message.pose, message.header  # type: ignore[attr-defined]
+    pose, header = message.pose, message.header
     turn = pose.orientation
     numbers = (turn.x, turn.y, turn.z, turn.w)
-    yaw_rad = None if not any(numbers) else _angles(turn)[2]
+    yaw_rad = None if not any(numbers) else angles_rad(turn)[2]
     return Goal(pose.position.x, pose.position.y, yaw_rad, header.frame_id)
 
 
@@ -142,14 +143,3 @@ def rotation(roll_rad: float, pitch_rad: float, yaw_rad: float) -> NDArray[np.fl
             (-sp, cp * sr, cp * cr),
         ]
     )
-
-
-def _angles(turn: object) -> tuple[float, float, float]:
-    """Roll, pitch and yaw of a quaternion of any length; NaN where it has none."""
-    x, y, z, w = (float(getattr(turn, axis)) for axis in "xyzw")
-    square = x * x + y * y + z * z + w * w
-    if not 0 < square < math.inf:
-        return math.nan, math.nan, math.nan
-    roll_rad = math.atan2(2 * (w * x + y * z), square - 2 * (x * x + y * y))
-    pitch_rad = math.asin(min(1.0, max(-1.0, 2 * (w * y - z * x) / square)))
-    return roll_rad, pitch_rad, math.atan2(2 * (w * z + x * y), square - 2 * (y * y + z * z))

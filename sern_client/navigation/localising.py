@@ -1,4 +1,4 @@
-"""Where a robot is: its odometry between moments, and where that frame lies on the map, as its scans say."""
+"""The place of a robot: its odometry between moments, and where that frame lies on the map, as its scans say."""
 
 import math
 from collections import deque
@@ -9,9 +9,9 @@ from sern_twin.motion import MOST_M
 from sern_twin.world.occupancy import Pose
 
 KEPT: Final = 200
-"""So many of it are kept: 4 s at 50 Hz."""
+"""Messages of odometry that are kept: 4 s at 50 Hz."""
 AHEAD_S: Final = 0.3
-"""So far beyond the last one its speed is believed; then nobody knows where the robot is."""
+"""The speed of the last one is believed for so long; then nobody knows where the robot is."""
 
 
 class Localiser:
@@ -20,7 +20,7 @@ class Localiser:
     def __init__(self, start: Pose = (0.0, 0.0, 0.0)) -> None:
         self._kept: deque[HeardOdometry] = deque(maxlen=KEPT)
         self.frame: Pose = start
-        """Where the origin of the odometry's frame is on the map."""
+        """The origin of the odometry's frame on the map."""
 
     @property
     def last(self) -> HeardOdometry | None:
@@ -39,7 +39,7 @@ class Localiser:
         return True
 
     def odometry_at(self, stamp_ns: int) -> Pose | None:
-        """Where the robot was in the odometry's frame; None: nothing near then is known."""
+        """The robot's place in the odometry's frame at a moment; None: nothing near it is known."""
         if not self._kept:
             return None
         last = self._kept[-1]
@@ -57,7 +57,7 @@ class Localiser:
         return None
 
     def at(self, stamp_ns: int) -> Pose | None:
-        """Where the robot was on the map."""
+        """The robot's place on the map at a moment; None as above."""
         found = self.odometry_at(stamp_ns)
         return None if found is None else placed(self.frame, found)
 

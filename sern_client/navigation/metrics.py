@@ -1,11 +1,22 @@
 """What Prometheus is told of a node that navigates."""
 
+from typing import TYPE_CHECKING
+
 from sern_client.navigation.node import NavigationNode
 from sern_navigation.navigator import State
 from sern_runtime.metrics import Metrics
 
+if TYPE_CHECKING:
+    from sern_client.navigation.perceiving import Perception
 
-def register_navigation(metrics: Metrics, node: NavigationNode) -> None:
+
+def register_navigation(metrics: Metrics, node: NavigationNode, perception: "Perception | None" = None) -> None:
+    metrics.counter(
+        "sern_perception_clouds_total",
+        "Clouds whose points were to get classes, by what became of them.",
+        ("outcome",),
+        lambda: [] if perception is None else [((key,), float(count)) for key, count in perception.outcomes.items()],
+    )
     metrics.gauge(
         "sern_navigation_state",
         "1 for what is done with the goal that is pursued, or was with the last one.",

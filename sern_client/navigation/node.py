@@ -36,7 +36,6 @@ from sern_navigation.navigator import Code, Command, Goal, Navigator, State, Sta
 from sern_navigation.scan import Cloud, ObstacleScan, obstacle_scan
 from sern_runtime import clock, ros_types
 from sern_runtime.http_routes import Health
-from sern_runtime.optional import OptionalParts
 from sern_twin.world.grid import Grid
 from sern_twin.world.occupancy import Pose
 
@@ -46,7 +45,6 @@ MAP_S: Final = 0.25
 """How often a scan is laid on the robot's own map at most."""
 STANDS_S: Final = 0.5
 """How long the base is told to stand after a goal has ended; then others may drive it."""
-FUTURE_S: Final = 0.1
 _DRIVING: Final = (State.FOLLOWING, State.RECOVERING)
 
 _log = logging.getLogger(__name__)
@@ -60,7 +58,7 @@ class Unused(StrEnum):
     """A cloud before the last one of a cycle."""
     OTHER_FRAME = "other_frame"
     NO_POSE = "no_pose"
-    """Where the robot was at a cloud is not known."""
+    """The robot's place at a cloud is not known."""
     NO_PLACE = "no_place"
     """Odometry whose numbers are no place."""
 
@@ -83,7 +81,6 @@ class NavigationNode:
         encoding: Encoding,
         *,
         planner: Callable[[Navigator], Planner] = PlannerProcess,
-        parts: OptionalParts | None = None,
         now: Callable[[], float] = clock.now,
         wall_ns: Callable[[], int] = time.time_ns,
     ) -> None:
@@ -104,7 +101,6 @@ class NavigationNode:
         self.cycles_s: list[float] = []
         """How long the last cycles took."""
         self._endpoint = endpoint
-        self._parts = parts or OptionalParts("mapping")
         self._now = now
         self._wall_ns = wall_ns
         self._writer = writing.Writer(encoding, grid.frame_id, options.base_frame)
@@ -118,7 +114,7 @@ class NavigationNode:
         self._said = SayOnce(_log)
         self._cloud: _Heard | None = None
         self._scan: tuple[int, Pose, ObstacleScan] | None = None
-        """Of the robot's own map: stamp, place and scan that are still to be laid down."""
+        """The scan that is still to be laid on the robot's own map: stamp, place and scan."""
         self._problems: dict[str, str] = {}
         """What is wrong with what is heard, in a line for each topic."""
         self._goal: Goal | None = None
@@ -388,7 +384,11 @@ class NavigationNode:
     def _tell(self, command: Command, pose: Pose | None, now: float, wall_ns: int) -> None:
         topics = self.options.topics
         level, text = self.words()
-        values = {key: str(value) for key, value in self.to_json().items() if not isinstance(value, dict)}
+        values = {
+            key: "" if value is None else str(value)
+            for key, value in self.to_json().items()
+            if not isinstance(value, dict)
+        }
         body = self._writer.status(level, text, values, stamp_ns=wall_ns)
         self._say(topics.status, writing.DIAGNOSTICS, body, wall_ns)
         if pose is None:
@@ -412,7 +412,7 @@ class NavigationNode:
 
     @property
     def status(self) -> Status:
-        """Of the goal that is pursued, or of the last one."""
+        """The status of the goal that is pursued, or of the last one."""
         if self._waits:
             return Status(State.FOLLOWING, Code.NONE, "the link is lost: the robot stands until it is back")
         return self.navigator.status if self._pursued else self._last
@@ -431,7 +431,7 @@ class NavigationNode:
         return "; ".join(filter(None, (*self._problems.values(), self.twin.problem)))
 
     def _complain(self, topic: str, line: str) -> None:
-        """Until something of that topic is right."""
+        """Note a problem of a topic, until something of it is right."""
         self._problems[topic] = line
         self._said(line, topic)
 

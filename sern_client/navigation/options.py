@@ -16,7 +16,7 @@ class OnLinkLoss(StrEnum):
 
 
 class Stamps(StrEnum):
-    """By which time messages are of."""
+    """The time that a message is of."""
 
     HEADER = "header"
     ARRIVAL = "arrival"
@@ -49,7 +49,7 @@ class TopicNames:
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """Where the scanner is on the robot: from the ground below its middle, roll, pitch and yaw (REP 103)."""
+    """The scanner's place on the robot, from the ground below its middle; roll, pitch and yaw as in REP 103."""
 
     x_m: float = 0.0
     y_m: float = 0.0
@@ -68,7 +68,7 @@ class NodeOptions:
     lidar: Mount = field(default_factory=Mount)
     localisation: Localisation = Localisation.ODOMETRY
     start: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """With localisation by scans: where the robot is on its map when it is switched on."""
+    """The robot's place on its map when it is switched on, with localisation by scans."""
     stamps: Stamps = Stamps.HEADER
     stamped: bool = False
     """Commands are TwistStamped."""

@@ -5,6 +5,7 @@ need no class.
 """
 
 import asyncio
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sern_client.endpoints.clouds import CLOUD_TYPE, cloud_body
+from sern_client.endpoints.common.saying import SayOnce
 from sern_core.summaries.bodies import Header
 from sern_core.summaries.clouds import read_cloud
 from sern_core.vocabulary.errors import BodyError
@@ -23,7 +25,7 @@ from sern_perception.classes import PointClass
 from sern_perception.detector import Cluster, clusters
 from sern_perception.projection import VLP16, ImageShape, of_points, project
 from sern_perception.segmenter import Segmenter
-from sern_runtime import ros_types
+from sern_runtime import ros_geometry, ros_types
 
 MARKER: Final = "visualization_msgs/msg/Marker"
 MARKERS: Final = "visualization_msgs/msg/MarkerArray"
@@ -33,6 +35,7 @@ COLOURS: Final = {
 }  # fmt: skip
 """Red, green and blue of a box, by what most of its points are; of a thing that no class is sure of OTHER's."""
 _CUBE, _ADD, _DELETE_ALL = 1, 0, 3
+_log = logging.getLogger(__name__)
 Publish = Callable[[str, str, bytes, int], None]
 """Name, type, body and stamp of a message."""
 
@@ -56,13 +59,13 @@ class Perception:
         self._segmenter = Segmenter() if options.model is None else Segmenter(options.model)
         self._last: tuple[bytes, Encoding] | None = None
         self._seq = 0
-        self.seen = 0
-        """How many clouds were looked at."""
-        self.unused = 0
-        """How many could not be."""
+        self._said = SayOnce(_log)
+        self.outcomes = dict.fromkeys(("seen", "unreadable", "left_out"), 0)
+        """How many clouds came, by what became of them."""
 
     def heard(self, body: bytes, encoding: Encoding) -> None:
         """The newest cloud: one that was not looked at before is left out."""
+        self.outcomes["left_out"] += self._last is not None
         self._last = body, encoding
 
     async def run(self) -> None:
@@ -74,10 +77,11 @@ class Perception:
             (body, encoding), self._last = self._last, None
             try:
                 made = await asyncio.to_thread(self.look, body, encoding)
-            except BodyError:
-                self.unused += 1
+            except BodyError as error:
+                self.outcomes["unreadable"] += 1
+                self._said(f"perception: {error}")
                 continue
-            self.seen += 1
+            self.outcomes["seen"] += 1
             for name, type_name, out, stamp_ns in made:
                 self._publish(name, type_name, out, stamp_ns)
 
@@ -111,17 +115,13 @@ class Perception:
             known = counts[kind] > 0
             red, green, blue = COLOURS[kind if known else PointClass.OTHER]
             size = [max(side_m, 0.05) for side_m in thing.size_m]
-            place = ros_types.new(
-                "geometry_msgs/msg/Point", self._encoding, x=thing.middle_m[0], y=thing.middle_m[1], z=thing.middle_m[2]
-            )
-            turn = ros_types.new("geometry_msgs/msg/Quaternion", self._encoding, w=1.0)
             markers.append(
                 make(
                     ns="obstacle",
                     id=number,
                     type=_CUBE,
                     action=_ADD,
-                    pose=ros_types.new("geometry_msgs/msg/Pose", self._encoding, position=place, orientation=turn),
+                    pose=ros_geometry.pose(self._encoding, *thing.middle_m),
                     scale=ros_types.new("geometry_msgs/msg/Vector3", self._encoding, x=size[0], y=size[1], z=size[2]),
                     color=ros_types.new("std_msgs/msg/ColorRGBA", self._encoding, r=red, g=green, b=blue, a=0.6),
                     text=kind.name.lower() if known else "unknown",

@@ -13,9 +13,12 @@ import sys
 from contextlib import suppress
 from typing import BinaryIO, Final, Protocol
 
+from sern_client.endpoints.common.saying import say_failure
 from sern_navigation.global_plan import Plan, PlanRequest, plan_for
 from sern_navigation.navigator import Navigator
 
+ANSWER_S: Final = 30.0
+"""A process that answers nothing for so long stands still; also a machine that is busy starts one by then."""
 _LENGTH: Final = struct.Struct("<Q")
 _COMMAND: Final = (sys.executable, "-P", "-m", "sern_client.navigation.planning")
 _log: Final = logging.getLogger(__name__)
@@ -50,10 +53,16 @@ class PlannerProcess:
         self.failures = 0
         """How often the process ended, and was started again."""
 
+    @property
+    def pid(self) -> int | None:
+        """The process; None: there is none now."""
+        return None if self._process is None else self._process.pid
+
     async def warm(self) -> None:
         """Return when the process runs: it imports scipy, which takes a second."""
         await self._ask(None)
         self._task = asyncio.create_task(self._run(), name="plans")
+        self._task.add_done_callback(say_failure)
 
     def look(self) -> None:
         """Have the plan made that the navigator wants: of several, the last one. After each of its steps."""
@@ -73,33 +82,38 @@ class PlannerProcess:
 
     async def _ask(self, request: PlanRequest | None) -> Plan | None:
         """The answer; None: the process has ended. The navigator gives up waiting then, and asks again."""
+        try:
+            async with asyncio.timeout(ANSWER_S):
+                return await self._answered(request)
+        except (OSError, EOFError, TimeoutError) as error:  # IncompleteReadError is an EOFError
+            self.failures += 1
+            _log.error("the process that plans does not answer (%s); it is started again", type(error).__name__)
+            await self._end()
+            return None
+
+    async def _answered(self, request: PlanRequest | None) -> Plan | None:
         process = self._process
         if process is None:
             process = self._process = await asyncio.create_subprocess_exec(
                 *_COMMAND, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, start_new_session=True
             )
         assert process.stdin is not None and process.stdout is not None
-        try:
-            body = pickle.dumps(request, pickle.HIGHEST_PROTOCOL)
-            process.stdin.write(_LENGTH.pack(len(body)) + body)
-            await process.stdin.drain()
-            (length,) = _LENGTH.unpack(await process.stdout.readexactly(_LENGTH.size))
-            answer: Plan | None = pickle.loads(await process.stdout.readexactly(length))
-        except (OSError, asyncio.IncompleteReadError):
-            self.failures += 1
-            self._process = None
-            _log.error("the process that plans has ended (%s); it is started again", await process.wait())
-            return None
+        body = pickle.dumps(request, pickle.HIGHEST_PROTOCOL)
+        process.stdin.write(_LENGTH.pack(len(body)) + body)
+        await process.stdin.drain()
+        (length,) = _LENGTH.unpack(await process.stdout.readexactly(_LENGTH.size))
+        answer: Plan | None = pickle.loads(await process.stdout.readexactly(length))
         return answer
 
     async def close(self) -> None:
         if self._task is not None:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
+        await self._end()
+
+    async def _end(self) -> None:
         process, self._process = self._process, None
         if process is not None:
-            assert process.stdin is not None
-            process.stdin.close()
             with suppress(ProcessLookupError):
                 process.kill()
             await process.wait()

@@ -10,7 +10,7 @@ from sern_core.vocabulary.types import Encoding
 from sern_navigation.collision_monitor import Speed
 from sern_navigation.costmap.costs import Costmap
 from sern_navigation.scan import ObstacleScan
-from sern_runtime import ros_types
+from sern_runtime import ros_geometry, ros_types
 from sern_twin.world.grid import Floats
 from sern_twin.world.occupancy import Pose
 
@@ -55,14 +55,18 @@ class Writer:
         else:
             yaws = places[:, 2] if places.shape[1] == 3 else np.zeros(len(places))
         poses = [
-            self._new(POSE, header=header, pose=self._pose((x, y, yaw)))
+            self._new(POSE, header=header, pose=ros_geometry.pose(self._encoding, x, y, yaw_rad=yaw))
             for (x, y), yaw in zip(places[:, :2].tolist(), yaws.tolist(), strict=True)
         ]
         return self._body(PATH, header=header, poses=poses)
 
     def stamped_pose(self, pose: Pose, *, stamp_ns: int) -> Any:
         """A PoseStamped, as a part of other messages."""
-        return self._new(POSE, header=self._header(stamp_ns, self._frame_id), pose=self._pose(pose))
+        return self._new(
+            POSE,
+            header=self._header(stamp_ns, self._frame_id),
+            pose=ros_geometry.pose(self._encoding, pose[0], pose[1], yaw_rad=pose[2]),
+        )
 
     def scan(self, scan: ObstacleScan, *, stamp_ns: int) -> bytes:
         """S_2D as a sensor_msgs/LaserScan of the robot's own frame, whose middle is that of the scanner."""
@@ -92,7 +96,7 @@ class Writer:
             resolution=grid.cell_m,
             width=grid.columns,
             height=grid.rows,
-            origin=self._pose((grid.west_m, grid.south_m, 0.0)),
+            origin=ros_geometry.pose(encoding, grid.west_m, grid.south_m),
         )
         header = self._header(stamp_ns, self._frame_id)
         return self._body(GRID, header=header, info=info, data=_TRANSLATED[costs].reshape(-1))
@@ -107,7 +111,6 @@ class Writer:
 
     def transform(self, pose: Pose, child_frame: str, *, stamp_ns: int) -> bytes:
         """A tf2_msgs/TFMessage: where another frame's origin is."""
-        half = pose[2] / 2
         transform = self._new(
             "geometry_msgs/msg/TransformStamped",
             header=self._header(stamp_ns, self._frame_id),
@@ -115,18 +118,10 @@ class Writer:
             transform=self._new(
                 "geometry_msgs/msg/Transform",
                 translation=self._vector(pose[0], pose[1]),
-                rotation=self._new("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(half), w=math.cos(half)),
+                rotation=ros_geometry.quaternion(self._encoding, pose[2]),
             ),
         )
         return self._body(TRANSFORMS, transforms=[transform])
-
-    def _pose(self, pose: Pose) -> Any:
-        half = pose[2] / 2
-        return self._new(
-            "geometry_msgs/msg/Pose",
-            position=self._new("geometry_msgs/msg/Point", x=float(pose[0]), y=float(pose[1]), z=0.0),
-            orientation=self._new("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(half), w=math.cos(half)),
-        )
 
     def _vector(self, x: float, y: float, z: float = 0.0) -> Any:
         return self._new("geometry_msgs/msg/Vector3", x=x, y=y, z=z)

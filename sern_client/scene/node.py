@@ -59,9 +59,9 @@ PERIOD_S: Final = 0.1
 WHOLE_S: Final = 5.0
 """How often the whole map is published at most: to who comes late, the last one is latched."""
 MOST_UPDATES: Final = 64
-"""So many blocks are published at once, at the most."""
+"""The most blocks that are published at once."""
 REPEAT_S: Final = 1.0
-"""Where nothing changes, one block is published over again so often: who missed an update has it in the end, and who
+"""One block is published over again so often where nothing changes: who missed an update has it in the end, and who
 navigates by the map knows that it is one of now."""
 DISCREPANCIES_S: Final = 0.5
 """How often discrepancies are published at most."""

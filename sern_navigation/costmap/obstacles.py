@@ -180,6 +180,6 @@ def _beside(lowest_m: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _on_all_sides(ground_m: Floats) -> Floats:
-    """From where to where ground was seen at a bearing and at both beside it, (sectors, 2)."""
+    """Ground that was seen at a bearing and at both beside it, from where to where, (sectors, 2)."""
     beside = np.stack((ground_m, np.roll(ground_m, 1, axis=0), np.roll(ground_m, -1, axis=0)))
     return np.stack((beside[..., 0].max(axis=0), beside[..., 1].min(axis=0)), axis=1)

@@ -75,8 +75,8 @@ class TwinLayer:
         return abs(now_s - self._stamp_s) <= self.options.staleness_s
 
     def unseen(self, now_s: float, window: Window, seen_free: Mask) -> Mask | None:
-        """Where it says that something stands and no real scan saw that nothing does, in the window's shape; None: it
-        is stale. `seen_free` (rows, columns): where real scans saw nothing."""
+        """Cells where it says that something stands and no real scan saw that nothing does, in the window's shape;
+        None: it is stale. `seen_free` (rows, columns): where real scans saw nothing."""
         return self._occupied[window.slices] & ~seen_free[window.slices] if self.fresh(now_s) else None
 
     def soft(self, now_s: float, window: Window, seen_free: Mask) -> Costs:

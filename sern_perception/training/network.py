@@ -107,7 +107,7 @@ class IntensityNet(nn.Module):  # type: ignore[misc]
         )
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Of channels (n, 5, rows, columns), without a look at intensity: scores of bins, and where in each bin the
+        """Take channels (n, 5, rows, columns) without a look at intensity: scores of bins, and where in each bin the
         intensity is, from -0.5 to 0.5; (n, bins, rows, columns) both."""
         there = (x[:, 4:5] > 0).to(x.dtype)
         ranges_m, heights_m = x[:, 4:5], x[:, 2:3]

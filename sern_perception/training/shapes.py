@@ -66,14 +66,14 @@ def drawn(random: Random, x_m: float, y_m: float, ground_m: float) -> Shape:
 
 
 def _between(start: Floats, along: Floats, half_m: Floats) -> tuple[Floats, Floats]:
-    """Where rays enter and leave what is between two planes for each axis."""
+    """Ranges at which rays enter and leave what is between two planes for each axis."""
     with np.errstate(divide="ignore", invalid="ignore"):
         one, other = (-half_m - start) / along, (half_m - start) / along
     return np.fmin(one, other).max(axis=1), np.fmax(one, other).min(axis=1)
 
 
 def _round(start: Floats, along: Floats, radius_m: float, *, axes: int) -> tuple[Floats, Floats]:
-    """Where rays enter and leave a ball (3 axes), or an upright cylinder without ends (2)."""
+    """Ranges at which rays enter and leave a ball (3 axes), or an upright cylinder without ends (2)."""
     start, along = start[:axes], along[:, :axes]
     square = (along**2).sum(axis=1)
     towards = along @ start

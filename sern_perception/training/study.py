@@ -28,7 +28,7 @@ OTHER_SCANS: Final = 160
 TEST_SCANS: Final = 100
 CALIBRATION_SCANS: Final = 32
 BUDGET: Final = Budget(steps=500, batch=4, columns=225)
-"""Of each training: a sixteenth of what the network that comes with SERN gets, so that there can be many."""
+"""Each training has a sixteenth of what the network that comes with SERN gets, so that there can be many."""
 ALIGNED: Final = "alignment"
 ALL: Final = "all: noise, rendered intensity, alignment, calibration"
 NAMES: Final = (

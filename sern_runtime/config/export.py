@@ -72,7 +72,7 @@ def _schema_text(name: str, schema: Json) -> str:
 
 
 def _finite(value: Any) -> Any:
-    """Without keys whose value is infinite, which JSON has not: limits that are none unless a file sets them."""
+    """The value without keys that are infinite, which JSON has not: limits that are none unless a file sets them."""
     if isinstance(value, dict):
         return {key: _finite(each) for key, each in value.items() if not _infinite(each)}
     return [_finite(each) for each in value] if isinstance(value, (list, tuple)) else value

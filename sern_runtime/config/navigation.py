@@ -66,9 +66,9 @@ class GridSection(Section):
     used, and that is said."""
 
     west_m: Annotated[float, Field(ge=-1e6, le=1e6)]
-    """Where the grid begins, in its frame."""
+    """West edge of the grid, in its frame."""
     south_m: Annotated[float, Field(ge=-1e6, le=1e6)]
-    """Where the grid begins, in its frame."""
+    """South edge of the grid, in its frame."""
     width_m: Annotated[float, Field(gt=0, le=10_000)]
     """How far it goes to the east."""
     length_m: Annotated[float, Field(gt=0, le=10_000)]
@@ -103,7 +103,7 @@ class NavigationTopics(Section):
     cloud: TopicText = "/points"
     """What its lidar sees: sensor_msgs/PointCloud2."""
     odometry: TopicText = "/odometry/filtered"
-    """Where it is: nav_msgs/Odometry, in the frame of the grid, or in any with `localisation: scans`."""
+    """The robot's place: nav_msgs/Odometry, in the frame of the grid, or in any with `localisation: scans`."""
     map: TopicText | None = None
     """The map of the site (nav_msgs/OccupancyGrid), whose obstacles are never driven into; null: there is none."""
     twin: TopicText | None = None
@@ -126,7 +126,7 @@ class NavigationTopics(Section):
     """What of each cloud stands in the way, edges of the ground among it: sensor_msgs/LaserScan. It is infinite where
     the ground was seen to be free, and NaN where nothing was seen; a scene takes it as a scanner of its robot."""
     own_map: TopicText = "/map"
-    """With `localisation: scans`: its map, nav_msgs/OccupancyGrid, and under NAME_updates what changes."""
+    """The robot's own map, with `localisation: scans`: nav_msgs/OccupancyGrid, and under NAME_updates what changes."""
     status: TopicText = "/navigation/status"
     """What it is doing, in words and values: diagnostic_msgs/DiagnosticArray."""
     action: TopicText = "/navigate_to_pose"
@@ -134,20 +134,20 @@ class NavigationTopics(Section):
 
 
 class LidarSection(Section):
-    """Where the lidar is on the robot, from the ground below its middle."""
+    """The lidar's place on the robot, from the ground below its middle."""
 
     x_m: Annotated[float, Field(ge=-10, le=10)] = 0.0
-    """Ahead of it."""
+    """Distance ahead of it."""
     y_m: Annotated[float, Field(ge=-10, le=10)] = 0.0
-    """To the left of it."""
+    """Distance to the left of it."""
     z_m: Annotated[float, Field(gt=0, le=10)] = 0.4
-    """Above the ground."""
+    """Height above the ground."""
     roll_rad: Annotated[float, Field(ge=-math.pi, le=math.pi)] = 0.0
-    """About its own axis ahead (REP 103)."""
+    """Turn about its own axis ahead (REP 103)."""
     pitch_rad: Annotated[float, Field(ge=-math.pi, le=math.pi)] = 0.0
     """Nose down is positive."""
     yaw_rad: Annotated[float, Field(ge=-math.pi, le=math.pi)] = 0.0
-    """To the left is positive."""
+    """Turn to the left."""
     frame_id: str | None = None
     """Clouds of another frame are not used; null: of any."""
 
@@ -209,22 +209,22 @@ class NavigationFile(FileModel):
     yaw_scale: Annotated[float, Field(gt=0.05, le=5)] = 1.0
     """How much the base turns of what it is told; wheels that skid turn less."""
     stamps: Literal["header", "arrival"] = "header"
-    """When a cloud or a pose was: as its header says by this machine's clock, or when it came, where headers have a
+    """The time of a cloud or a pose: as its header says by this machine's clock, or when it came, where headers have a
     time of their own (a simulator's)."""
     localisation: Literal["odometry", "scans"] = "odometry"
     """`odometry`: it says where the robot is on the grid. `scans`: it drifts, and is corrected by matching each scan
     with the map that the robot makes of all; /tf then has where its frame lies."""
     start: Annotated[tuple[float, float, float], Field(min_length=3, max_length=3)] = (0.0, 0.0, 0.0)
-    """With `localisation: scans`: where the odometry begins on the grid, [x_m, y_m, yaw_rad]."""
+    """The place on the grid where the odometry begins, with `localisation: scans`: [x_m, y_m, yaw_rad]."""
     on_link_loss: Literal["continue", "wait", "abort"] = "continue"
     """While `topics.link` says that the operator cannot be reached: `continue` to the goal, stand and `wait` until the
     link is back, or `abort` the goal."""
     link_timeout_s: Seconds = 5.0
-    """Without a word on `topics.link` for so long the link counts as lost: the robot's client is not there."""
+    """The link counts as lost without a word on `topics.link` for so long: the robot's client is not there."""
     seed: Annotated[int, Field(ge=0, lt=1 << 63)] = 1
-    """Of the controller's random trajectories."""
+    """Start value of the controller's random trajectories."""
     navigator: SectionOf[NavigatorOptions] = Field(default_factory=SectionOf[NavigatorOptions])
-    """When a goal is reached, and when something else is tried (Nav2's goal and progress checkers)."""
+    """What counts as reached, and as no progress (Nav2's goal and progress checkers)."""
     planner: SectionOf[PlannerOptions] = Field(default_factory=SectionOf[PlannerOptions])
     """The way to the goal (Nav2's planner server with a 2-D planner)."""
     controller: SectionOf[MppiOptions] = Field(default_factory=SectionOf[MppiOptions])
@@ -244,7 +244,7 @@ class NavigationFile(FileModel):
     scan: SectionOf[ScanOptions] = Field(default_factory=SectionOf[ScanOptions])
     """What counts as an obstacle in a cloud."""
     mapping: SectionOf[MapperOptions] = Field(default_factory=SectionOf[MapperOptions])
-    """With `localisation: scans`: how scans are matched and laid down."""
+    """How scans are matched and laid down, with `localisation: scans`."""
     perception: PerceptionSection | None = None
     """Classes of points, and boxes; null: there are none."""
     type_paths: tuple[PathText, ...] = ()

@@ -26,9 +26,9 @@ class MapUpdateOptions:
     update_s: float = 0.1
     """How often updates are, at the most."""
     most_blocks: int = 64
-    """So many are updated at once, at the most."""
+    """The most blocks that are updated at once."""
     repeat_s: float = math.inf
-    """So long after the last message one block is updated although it is as it was, in turn: who missed an update has
+    """One block is updated so long after the last message although it is as it was, in turn: who missed an update has
     it in the end, and hears that the map is of now. Infinite: never."""
 
     def __post_init__(self) -> None:

@@ -31,9 +31,9 @@ UNKNOWN: Final = -1
 FREE: Final = 0
 OCCUPIED: Final = 100
 CLEARED: Final = 1
-"""In `live`: scans see through what the twin has there. It is free on the map, whatever was added."""
+"""A cell of `live`: scans see through what the twin has there. It is free on the map, whatever was added."""
 LASTING: Final = 99
-"""In `twin_only` and `base`: of a kind that scans do not see. It is occupied on the map, whatever they say."""
+"""A cell of `twin_only` or `base` of a kind that scans do not see. It is occupied on the map, whatever they say."""
 MOST_VERSION: Final = 2**64 - 1
 MOST_WRITER_BYTES: Final = 64
 MOST_PATCH_BYTES: Final = 8_000

@@ -123,7 +123,7 @@ def test_a_link_that_is_gone_for_good_brings_nothing_new() -> None:
 
 
 def test_a_link_that_is_late_and_never_stale_changes_no_drive(monkeypatch: pytest.MonkeyPatch) -> None:
-    """So that its drives are those of the first profile."""
+    """Its drives are those of the first profile."""
     found, (first, late, *gone) = campus_of(3), PROFILES
     assert late.always_fresh and not any(link.always_fresh for link in gone)
     monkeypatch.setattr(episode, "MOST_S", 4.0)

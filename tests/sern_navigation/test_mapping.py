@@ -48,8 +48,8 @@ def walls_off_m(mapper: Mapper, world: World) -> float:
 
 
 def test_a_robot_that_drives_knows_where_it_is_and_by_wheels_alone_it_is_lost() -> None:
-    """In circles, by wheels that are wrong about turns. The same scans make two maps: one where they fit on it, and one
-    where the wheels say that they are."""
+    """Drive in circles, by wheels that are wrong about turns. The same scans make two maps: one where they fit on it,
+    and one where the wheels say that they are."""
     robot = jackal(world_of([*box(3.0, -1.0, 4.0, 1.0), *box(-5.0, 3.0, -4.0, 6.0), *box(-2.0, -6.0, 0.0, -5.0)], 9.0))
     mapper, alone = Mapper(GRID), Mapper(GRID, MapperOptions(matching=MatchOptions(min_points=1_000_000)))
     wheels, place, drifted = robot.state.odometry, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)

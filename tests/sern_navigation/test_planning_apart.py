@@ -59,7 +59,7 @@ def asked(one: Navigator, now_s: float = 0.0) -> PlanRequest:
 
 
 def driven(robot: SimulatedJackal, one: Navigator, late: int, seconds: float) -> Command:
-    """Until the goal is reached or given up. An answer comes so many cycles after it was asked for."""
+    """Drive until the goal is reached or given up. An answer comes so many cycles after it was asked for."""
     wait: list[PlanRequest] = []
     for number in range(round(seconds / PERIOD_S)):
         pose = robot.state.pose
@@ -221,7 +221,7 @@ def test_it_drives_to_its_goal_with_plans_of_elsewhere() -> None:
 
 @pytest.mark.parametrize("seed", seeds(6))
 def test_late_plans_lead_into_nothing(seed: int) -> None:
-    """In worlds that nobody knows, with answers up to a second late."""
+    """Worlds that nobody knows, with answers up to a second late."""
     random = np.random.default_rng(seed)
     walls: list[Wall] = []
     while len(walls) < 4 * 5:

@@ -25,12 +25,12 @@ RINGS_RAD: Final = tuple(math.radians(-30.67 + 4 / 3 * number) for number in ran
 OPTIONS: Final = ScanOptions(origin_m=(0.0, 0.0, HEIGHT_M), ring_elevations_rad=RINGS_RAD)
 GRID: Final = Grid(-15.0, -15.0, 0.1, 300, 300)
 B_ON_A: Final[Pose] = (-0.487, -0.127, 0.0122)
-"""Where b was taken from, seen from a, as those who recorded them state it. GICP of the clouds finds that within 2 cm
+"""The place of b, seen from a, as those who recorded them state it. GICP of the clouds finds that within 2 cm
 and a quarter of a degree."""
 
 
 def points_of(name: str) -> NDArray[np.float32]:
-    """In the frame of the ground below the scanner; rays that met nothing are at the scanner itself."""
+    """Points in the frame of the ground below the scanner; rays that met nothing are at the scanner itself."""
     points = read_ply(recording(f"lidar_scan_{name}.ply"))[:, :3].copy()
     points[:, 2] += HEIGHT_M
     return points
@@ -81,7 +81,7 @@ def test_without_its_tilt_falling_ground_before_a_wall_is_taken_for_a_ditch() ->
 
 
 def test_the_second_scan_is_laid_where_it_was_taken() -> None:
-    """From predictions that are off by what a search of 0.3 m and 0.2 rad allows."""
+    """The predictions are off by what a search of 0.3 m and 0.2 rad allows."""
     mapper, ends = Mapper(GRID), ends_m(scan_of("b"))
     assert mapper.add((0.0, 0.0, 0.0), scan_of("a")).placed is Placed.PREDICTED
     cells, draw = mapper.occupancy.cells(), np.random.default_rng(1)

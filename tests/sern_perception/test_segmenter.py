@@ -15,7 +15,7 @@ pytest.importorskip("onnxruntime", reason="needs onnxruntime: pip install 'sern[
 
 
 def test_the_network_knows_the_clouds_that_the_stand_in_publishes() -> None:
-    """Of worlds that it was not trained on, through the same door as a robot's clouds: intensity in its unit, and rays
+    """Worlds that it was not trained on, through the same door as a robot's clouds: intensity in its unit, and rays
     where it has them."""
     pytest.importorskip("mujoco", reason="needs mujoco: pip install 'sern[sim]'")
     from sern_perception.training.scans import places, scattered

@@ -68,7 +68,7 @@ def test_covariances_that_are_alike_are_no_distance_apart() -> None:
 
 
 def test_calibration_gives_each_layer_the_statistics_of_what_it_sees() -> None:
-    """After it, what each normalisation makes of these scans has mean 0 and variance 1, times its own weights."""
+    """What each normalisation makes of these scans has mean 0 and variance 1 after it, times its own weights."""
     net, there = train(scans(), 1, BUDGET), scans(lift_m=3.0).channels
     seen: dict[str, tuple[float, float]] = {}
 

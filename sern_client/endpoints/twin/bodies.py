@@ -11,6 +11,7 @@ from sern_core.vocabulary.errors import BodyError, ConfigError
 from sern_core.vocabulary.names import plain_type
 from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
+from sern_runtime.ros_geometry import angles_rad, pose
 from sern_twin.fixes import Fix
 from sern_twin.geodesy import UNITY_FROM_ENU
 from sern_twin.motion import Motion, Twist
@@ -51,7 +52,7 @@ def read_pose(body: bytes, encoding: Encoding) -> Pose:
     message = read_message(body, ODOMETRY, encoding)
     pose, twist = message.pose.pose, message.twist.twist
     motion = Motion(
-        pose.position.x, pose.position.y, _yaw_rad(pose.orientation),
+        pose.position.x, pose.position.y, angles_rad(pose.orientation)[2],
         Twist(twist.linear.x, twist.linear.y, twist.angular.z),
     )  # fmt: skip
     return Pose(
@@ -109,14 +110,6 @@ def read_message(body: bytes, type_name: str, encoding: Encoding) -> Any:
 def stamp_of(stamp: Any) -> int:
     """A ROS time in nanoseconds."""
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
-
-
-def _yaw_rad(orientation: Any) -> float:
-    """The heading of a quaternion, whatever its length; NaN where it has none."""
-    x, y, z, w = (getattr(orientation, axis) for axis in "xyzw")
-    if not x * x + y * y + z * z + w * w > 0:
-        return math.nan
-    return math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 
 class Writer:
@@ -183,12 +176,7 @@ class Writer:
         return self._body(DIAGNOSTICS, header=self._header(stamp_ns, ""), status=[status])
 
     def _pose(self, motion: Motion, z_m: float) -> Any:
-        half = motion.yaw_rad / 2
-        return self._new(
-            "geometry_msgs/msg/Pose",
-            position=self._new("geometry_msgs/msg/Point", x=motion.x_m, y=motion.y_m, z=z_m),
-            orientation=self._new("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(half), w=math.cos(half)),
-        )
+        return pose(self._encoding, motion.x_m, motion.y_m, z_m, motion.yaw_rad)
 
     def _vector(self, x: float, y: float, z: float) -> Any:
         return self._new("geometry_msgs/msg/Vector3", x=x, y=y, z=z)

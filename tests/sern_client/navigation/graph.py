@@ -41,7 +41,7 @@ class Graph:
 
     @property
     def endpoint(self) -> Any:
-        """As the endpoint of a node, of which it has what a node uses."""
+        """The graph as the endpoint of a node, of which it has what a node uses."""
         return self
 
     def subscribe(self, name: TopicName, sink: Sink) -> Closing:

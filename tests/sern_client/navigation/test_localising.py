@@ -1,4 +1,4 @@
-"""Where a robot is between what its odometry says."""
+"""The place of a robot between what its odometry says."""
 
 import math
 

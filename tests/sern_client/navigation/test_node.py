@@ -2,7 +2,9 @@
 
 import asyncio
 import math
-from collections.abc import AsyncIterator, Callable, Sequence
+import os
+import signal
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from functools import partial
@@ -27,13 +29,14 @@ from sern_sim.world import World
 from sern_twin.world.grid import Grid
 from tests.sern_client.navigation import bodies
 from tests.sern_client.navigation.graph import Graph
+from tests.support import until
 
 GRID: Final = Grid(-5.0, -5.0, 0.1, 100, 100)
 PERIOD_S: Final = 0.1
 BEGIN_NS: Final = 1_700_000_000 * 10**9
 TOPICS: Final = TopicNames(map="/map", twin="/twin/scene/map", link="/sern/link", own_map="/own_map")
 Walls = Sequence[tuple[float, float, float, float, float]]
-"""From where to where, and how high [m]."""
+"""Each from where to where, and how high [m]."""
 FEW: Final = NavigatorOptions(controller=MppiOptions(batch_size=200))
 
 
@@ -136,12 +139,6 @@ async def settled() -> None:
     """What waits for a result has it."""
     for _ in range(5):
         await asyncio.sleep(0)
-
-
-async def until(met: Callable[[], bool]) -> None:
-    """Return when a thread or process has done something."""
-    while not met():  # noqa: ASYNC110  (nobody tells)
-        await asyncio.sleep(0.01)
 
 
 def _has_scans(site: Scene, number: int) -> bool:
@@ -425,3 +422,28 @@ async def test_plans_come_from_a_process_of_their_own() -> None:
         assert navigator.path_m[-1] == pytest.approx((1.0, 0.0), abs=0.11)
     finally:
         await planner.close()
+
+
+async def test_a_process_that_plans_and_is_killed_is_started_again(caplog: pytest.LogCaptureFixture) -> None:
+    navigator = Navigator(GRID, np.random.default_rng(1), FEW, plans_itself=False)
+    planner = PlannerProcess(navigator)
+    points = SimulatedJackal(Random(1)).cloud(5_760)[:, :3].astype(np.float64)
+    points[:, 2] += LIDAR_HEIGHT_M
+
+    def wants() -> None:
+        navigator.go(Goal(1.0, 0.0))
+        navigator.step(0.0, (0.0, 0.0, 0.0), Cloud(points, 0.0))
+        planner.look()
+
+    try:
+        await planner.warm()
+        assert planner.pid is not None
+        os.kill(planner.pid, signal.SIGKILL)
+        wants()
+        await until(lambda: planner.failures == 1)
+        assert "does not answer" in caplog.text and not len(navigator.path_m)
+        wants()
+        await until(lambda: bool(len(navigator.path_m)))
+    finally:
+        await planner.close()
+    assert planner.pid is None

@@ -11,7 +11,7 @@ from sern_twin.world.map_updates import MapUpdate, MapUpdateOptions, MapUpdates
 from sern_twin.world.patches import FREE, OCCUPIED, UNKNOWN, Cells
 
 GRID = Grid(0.0, 0.0, 0.1, 40, 30)
-"""Of 3 by 2 blocks, those at its ends smaller."""
+"""A grid of 3 by 2 blocks, those at its ends smaller."""
 
 
 def applied(cells: Cells, due: Cells | tuple[MapUpdate, ...]) -> Cells:
