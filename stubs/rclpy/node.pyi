@@ -3,6 +3,7 @@ from typing import Any
 
 from rclpy.client import Client
 from rclpy.context import Context
+from rclpy.guard_condition import GuardCondition
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.service import Service
@@ -12,6 +13,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 class NodeNameNonExistentError(Exception): ...
 
 class Node:
+    context: Context
     def __init__(
         self,
         node_name: str,
@@ -47,6 +49,7 @@ class Node:
         *,
         raw: bool = False,
     ) -> Subscription: ...
+    def create_guard_condition(self, callback: Callable[[], object]) -> GuardCondition: ...
     def destroy_publisher(self, publisher: Publisher) -> bool: ...
     def destroy_subscription(self, subscription: Subscription) -> bool: ...
     def destroy_node(self) -> None: ...

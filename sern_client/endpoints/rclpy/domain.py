@@ -85,8 +85,7 @@ class Domain:
                 self._options.node_name, context=context, use_global_arguments=False, enable_rosout=False,
                 start_parameter_services=False,
             )  # fmt: skip
-            executor = Executor(context=context)
-            executor.add_node(node)
+            executor = Executor(node)
             failed.pop_all()
         handover = Handover(
             asyncio.get_running_loop(), max_bytes=self._options.max_buffer_bytes, rest=lambda: time.sleep(REST_S)

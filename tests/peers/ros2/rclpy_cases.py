@@ -4,15 +4,17 @@ import asyncio
 import logging
 import os
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import pytest
 import rclpy
 from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from sern_client.endpoints.base import Held, ServiceInfo
@@ -23,7 +25,7 @@ from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from tests.peers.dds.peer import free_domain
 from tests.peers.ros2.sourced import RosNode, RosNodes, until_answered
-from tests.support import Events, until
+from tests.support import DEADLINE_S, Events, until
 
 STRING = "std_msgs/msg/String"
 
@@ -200,6 +202,39 @@ async def test_a_domain_whose_executor_is_shut_down_ends_alone(place: Place, cap
 
     await write(nodes[1], MANY, "still there")
     await until(lambda: heard_two.got[-1] == "still there")
+
+
+async def test_an_executor_that_is_about_to_wait_ends_all_the_same(place: Place) -> None:
+    """It has looked whether it is to end, and comes to wait only after it was told to."""
+    endpoint, _ = await place.endpoint(free_domain())
+    opened = endpoint.domain._open
+    assert opened is not None
+    executor, spinning = opened.executor, opened.thread
+    about_to_wait, told = Event(), Event()
+    get_nodes, shutdown, trigger = executor.get_nodes, SingleThreadedExecutor.shutdown, executor._leaving.trigger
+
+    def nodes() -> list[Node]:
+        found = get_nodes()
+        about_to_wait.set()
+        told.wait()
+        return found
+
+    def before_going_on(call: Callable[..., object]) -> Callable[..., object]:
+        def called(*args: Any) -> object:
+            answer = call(*args)
+            told.set()
+            return answer
+
+        return called
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(executor, "get_nodes", nodes)
+        patch.setattr(executor._leaving, "trigger", before_going_on(trigger))
+        patch.setattr(SingleThreadedExecutor, "shutdown", before_going_on(shutdown))
+        executor.wake()
+        await asyncio.to_thread(about_to_wait.wait)
+        await asyncio.wait_for(endpoint.stop(), DEADLINE_S)
+    assert not spinning.is_alive()
 
 
 async def test_what_came_over_a_link_is_not_taken(place: Place, caplog: pytest.LogCaptureFixture) -> None:

@@ -65,6 +65,7 @@ class Graph:
         self.ended = Event()
         self.failures: list[Exception] = []
         self.destroyed = False
+        self.context: object = None
 
     def offer(
         self, topic: str, type_name: str = STRING, *, node: str = "talker", latched: bool = False, reliable: bool = True
@@ -153,6 +154,9 @@ class Graph:
             del self.publishers[publisher.topic]
         return True
 
+    def create_guard_condition(self, callback: Callable[[], None]) -> Any:
+        return SimpleNamespace(trigger=callback)
+
     def destroy_node(self) -> None:
         self.destroyed = True
 
@@ -183,6 +187,8 @@ def graph(monkeypatch: pytest.MonkeyPatch) -> Graph:
         def ok(self) -> bool:
             return True
 
+    made.context = Context()
+
     class Executor:
         def __init__(self, *, context: object) -> None:
             assert isinstance(context, Context)
@@ -197,7 +203,8 @@ def graph(monkeypatch: pytest.MonkeyPatch) -> Graph:
                 made.ended.clear()
                 raise made.failures.pop(0)
 
-        def shutdown(self) -> bool:
+        def shutdown(self, timeout_sec: float | None = None) -> bool:
+            del timeout_sec
             made.ended.set()
             return True
 
@@ -502,7 +509,7 @@ async def test_what_is_to_be_done_of_a_response_is_done_at_once(graph: Graph) ->
     from sern_client.endpoints.rclpy.executor import Executor
 
     done: list[tuple[int, int]] = []
-    executor: Any = Executor(context=sys.modules["rclpy.context"].Context())
+    executor: Any = Executor(sys.modules["rclpy.node"].Node())
     assert executor.create_task(lambda one, two: done.append((one, two)), 1, two=2) is None
     assert done == [(1, 2)]
 
