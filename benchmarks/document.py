@@ -114,6 +114,8 @@ TITLES: Final = {
     "paper_time_s": "time in the paper, s",
     "paper_interventions_run": "interventions in the paper",
     "counted_things": "things",
+    "counted_cleared": "real cells cleared",
+    "counted_refused": "scans that did not fit",
     "flags_hour": "an hour",
     "driven_hours": "hours driven",
 }

@@ -32,6 +32,14 @@ _BEFORE_M: Final = 0.12
 _OVER: Final = np.float32(1e-3)
 """A ray that passes over another is so much steeper."""
 _TURN: Final = 2 * math.pi
+_ARCTAN: Final = tuple(
+    np.float32(factor) for factor in (-0.01171906, 0.05264717, -0.11642635, 0.19354035, -0.33262283, 0.99997723)
+)
+"""Factors of x¹¹ to x of the odd polynomial that is nearest to arctan between 0 and 1 (found by least squares that were
+weighted anew until all its maxima were alike): within 1.8e-6."""
+_ARCTAN_ERROR_RAD: Final = 5e-6
+"""More than that, and what float32 rounds."""
+_LEAST: Final = np.finfo(np.float32).tiny
 _MOST_TILT_RAD: Final = 0.7
 _MOST_M: Final = 1e4
 """Nothing is so far away, and its square is a number still."""
@@ -201,8 +209,8 @@ def obstacle_scan(cloud: Cloud, options: ScanOptions) -> ObstacleScan | Refused:
             f"a cloud of {len(used)} points of the surroundings: {options.min_points} are the least; "
             "see whether the scanner is covered",
         )
-    places = x[used], y[used], z[used]
-    return _Reading(places, ranges_m[used], len(near), _level(cloud, options), options).scan(cloud.stamp_s)
+    places = x.take(used), y.take(used), z.take(used)
+    return _Reading(places, ranges_m.take(used), len(near), _level(cloud, options), options).scan(cloud.stamp_s)
 
 
 def planar_scan(
@@ -277,6 +285,36 @@ def _sectors(bearings_rad: NDArray[np.floating[Any]], sectors: int) -> Indices:
     return found
 
 
+def _sectors_of(x: NDArray[np.float32], y: NDArray[np.float32], sectors: int) -> Indices:
+    """The sectors of places, those that arctan2 gives, which alone takes a fifth of a scan.
+
+    An odd polynomial of the lesser over the greater side says all of them but those so near to a border of two that its
+    error counts; arctan2 says these.
+    """
+    across, along = np.abs(x), np.abs(y)
+    steep = along > across
+    share = np.minimum(across, along)
+    share /= np.maximum(np.maximum(across, along), _LEAST)
+    square = share * share
+    turn = np.full(len(x), _ARCTAN[0], np.float32)
+    for factor in _ARCTAN[1:]:
+        turn *= square
+        turn += factor
+    turn *= share
+    np.subtract(np.float32(math.pi / 2), turn, out=turn, where=steep)
+    np.subtract(np.float32(math.pi), turn, out=turn, where=x < 0)
+    np.copysign(turn, y, out=turn)
+    turn += np.float32(math.pi)
+    turn *= np.float32(sectors / _TURN)
+    near = np.floor(turn)
+    turn -= near
+    turn -= np.float32(0.5)
+    unsure = np.flatnonzero(np.abs(turn) > np.float32(0.5 - _ARCTAN_ERROR_RAD * sectors / _TURN))
+    found: Indices = near.astype(np.intp)
+    found[unsure] = _sectors(np.arctan2(y.take(unsure), x.take(unsure)), sectors)
+    return found
+
+
 class _Reading:
     """One cloud, x, y and z (n,) from the scanner on, first those within range: its walks outwards, all bearings at
     once."""
@@ -296,18 +334,18 @@ class _Reading:
         self._shape = len(self._bins_m) - 1, options.sectors
         self._r = ranges_m
         self._x, self._y, self._z = places[0], places[1], places[2] + np.float32(self._height_m)
-        self._sector = _sectors(np.arctan2(self._y, self._x), options.sectors)
+        self._sector = _sectors_of(self._x, self._y, options.sectors)
         fine = np.arange(math.ceil(options.range_max_m / _FINE_M) + 1) * _FINE_M + 1e-6
         table = np.searchsorted(self._bins_m[1:-1], fine, side="right")
         self._near, self._far = slice(0, within), slice(within, None)
-        number = table[(self._r[self._near] / np.float32(_FINE_M)).astype(np.intp)]
+        number = table.take((self._r[self._near] / np.float32(_FINE_M)).astype(np.intp))
         self._key = number * options.sectors + self._sector[self._near]
 
     def scan(self, stamp_s: float) -> ObstacleScan:
         options, near, key = self._options, self._near, self._key
         r, z = self._r[near], self._z[near]
         ground = self._walk(r, z, key)
-        over = z - (ground.z_m.reshape(-1)[key] + ground.slope.reshape(-1)[key] * (r - ground.r_m.reshape(-1)[key]))
+        over = z - (ground.z_m.take(key) + ground.slope.take(key) * (r - ground.r_m.take(key)))
         obstacle = np.flatnonzero((over >= options.min_obstacle_height) & (over <= options.max_obstacle_height))
         nearest = np.full(options.sectors, np.inf, np.float32)
         np.minimum.at(nearest, self._sector[obstacle], r[obstacle])
@@ -337,11 +375,11 @@ class _Reading:
         options, cells = self._options, self._shape[0] * self._shape[1]
         low_z = np.full(cells, np.inf, np.float32)
         np.minimum.at(low_z, key, z)
-        up = z - low_z[key]
+        up = z - low_z.take(key)
         lowest = np.flatnonzero(up <= 0)
         low_r = np.zeros(cells, np.float32)
-        low_r[key[lowest]] = r[lowest]
-        stands = self._stands(up, np.abs(r - low_r[key]), key).reshape(self._shape)
+        low_r[key.take(lowest)] = r.take(lowest)
+        stands = self._stands(up, np.abs(r - low_r.take(key)), key).reshape(self._shape)
         low_z, low_r = low_z.reshape(self._shape), low_r.reshape(self._shape)
         ground = _Ground(self._shape)
         steepest, rise, fall = (
@@ -386,10 +424,13 @@ class _Reading:
                 close = at_r <= options.drop_range_m
                 falls = sunk & ((tilt < -steepest) | ((bend < -fall) & close))
                 dips = sunk & (bend < -fall / 3) & close
-                if dips.any() or falls.any():
-                    edges_m = self._edges_m(at_r, at_z, before, r_m, z_m)
-                    ground.edges_m[falls] = np.minimum(ground.edges_m, edges_m)[falls]
-                    ditch_m = np.where(dips, edges_m, ditch_m)
+                at = np.flatnonzero(dips | falls)
+                if len(at):
+                    edges_m = self._edges_m(at_r[at], at_z[at], before[at], r_m[at], z_m[at])
+                    falling = falls[at]
+                    ground.edges_m[at[falling]] = np.minimum(ground.edges_m[at], edges_m)[falling]
+                    dipping = dips[at]
+                    ditch_m[at[dipping]] = edges_m[dipping]
                     is_ground &= ~falls
                     ditches = True
             if ditches:

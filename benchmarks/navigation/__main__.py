@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Final
 
 from benchmarks.common import Report, main, positive
-from benchmarks.navigation import costs, drives
+from benchmarks.navigation import corrections, costs, drives, mapping_costs
 
-PARTS: Final = ("modes", "accuracies", "links", "discrepancies", "costs")
+PARTS: Final = ("modes", "accuracies", "links", "corrections", "mapping", "costs")
 
 
 def bench(options: argparse.Namespace, report: Report) -> None:
@@ -29,12 +29,14 @@ def bench(options: argparse.Namespace, report: Report) -> None:
                 if part in parts:
                     drive(count, report, known)
         report.note(f"drives are of commit {', '.join(sorted(known.commits))}")
-    if "discrepancies" in parts:
-        costs.discrepancies(2 if options.quick else 12, report)
+    if "corrections" in parts:
+        corrections.corrections(2 if options.quick else 12, report)
+    if "mapping" in parts:
+        mapping_costs.accuracy(report, 10 if options.quick else 200, 1 if options.quick else 12)
     if "costs" in parts:
         costs.cycle(report, 60 if options.quick else 400)
         costs.plans(report, 10 if options.quick else 100)
-        costs.scans(report, 30 if options.quick else 200)
+        mapping_costs.costs(report, 30 if options.quick else 200)
         report.note("cycles, plans and scans in CPU time of one process")
 
 

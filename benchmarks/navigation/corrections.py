@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from benchmarks.common import Report, percentile
+from benchmarks.link.figures import NEVER_S
 from benchmarks.navigation.campus import GRID, YARD, campus, cells_of
 from sern_sim.robot import LIDAR_RANGE_M, STEP_S, Pose2, RobotState, SimulatedJackal
 from sern_twin.world.correction import corrected, map_cells
@@ -18,6 +19,8 @@ from sern_twin.world.patches import FREE, OCCUPIED, UNKNOWN, Cells
 PERIOD_S: Final = 0.1
 WATCHED_S: Final = 20.0
 STARTS: Final = 6
+ACCURACY: Final = 0.8
+CASE: Final = "where the twin is wrong"
 CLEAR_M: Final = 2.0
 BEAMS: Final = 720
 NOISE_M: Final = 0.02
@@ -38,28 +41,28 @@ class Watched(NamedTuple):
     """Cells of real things that were cleared at the end."""
 
 
-def corrections(seeds: int, report: Report, *, accuracies: tuple[float, ...] = (0.8,)) -> None:
-    """A robot drives rounds at places of a campus whose twin, of which nothing is on the base map, is right in so many
+def corrections(seeds: int, report: Report) -> None:
+    """A robot drives rounds at places of a campus whose twin, of which nothing is on the base map, is right in 8 of 10
     of its things, with a localisation that is off by 2 cm and half a degree."""
     late_s: dict[DiscrepancyKind, list[float]] = {kind: [] for kind in DiscrepancyKind}
     flags, cleared, hours = 0, 0, 0.0
-    for accuracy in accuracies:
-        for seed in range(seeds):
-            for start in range(STARTS):
-                made = watched(seed, start, accuracy)
-                for kind, times_s in made.late_s.items():
-                    late_s[kind] += times_s
-                flags, cleared, hours = flags + made.false_flags, cleared + made.cleared_cells, hours + WATCHED_S / 3600
+    for seed, start in ((seed, start) for seed in range(seeds) for start in range(STARTS)):
+        made = watched(seed, start, ACCURACY)
+        for kind, times_s in made.late_s.items():
+            late_s[kind] += times_s
+        flags, cleared, hours = flags + made.false_flags, cleared + made.cleared_cells, hours + WATCHED_S / 3600
     for kind, what in (
         (DiscrepancyKind.PHANTOM, "a phantom is cleared on the map"),
         (DiscrepancyKind.UNKNOWN_OBSTACLE, "an unknown obstacle is on the map"),
     ):
-        ordered = sorted(late_s[kind])
-        report.row("where the twin is wrong", what, counted_things=float(len(ordered)),
-                   median_s=percentile(ordered, 0.5), p95_s=percentile(ordered, 0.95), most_s=ordered[-1])  # fmt: skip
-        report.reach(f"{what} after it was first seen, p95, s", percentile(ordered, 0.95), 1.0)
-    report.row("where the twin is wrong", "told, and not so", flags_hour=flags / hours, driven_hours=hours,
-               real_cells_cleared=float(cleared))  # fmt: skip
+        ordered = sorted(min(time_s, NEVER_S) for time_s in late_s[kind])
+        if ordered:
+            report.row(CASE, what, counted_things=len(ordered), median_s=percentile(ordered, 0.5),
+                       p95_s=percentile(ordered, 0.95), most_s=ordered[-1])  # fmt: skip
+            report.reach(f"{what} after it was first seen, p95, s", percentile(ordered, 0.95), 1.0)
+    report.row(
+        CASE, "told, and not so", flags_hour=flags / hours, driven_hours=hours, counted_real_cells_cleared=cleared
+    )
     report.reach("discrepancies that are none, an hour", flags / hours, 1.0)
 
 

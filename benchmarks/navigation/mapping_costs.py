@@ -55,16 +55,19 @@ def costs(report: Report, count: int) -> None:
 def accuracy(report: Report, predictions: int, drives: int) -> None:
     """The place of the second real scan on the map of the first, from predictions up to 0.25 m and 0.15 rad off; and
     drives of `DRIVE_S` with wheel odometry alone."""
-    if not recordings.absent():
+    if recordings.absent():
+        report.note("the place of a second scan is not measured: the real scans are not beside the checkout")
+    else:
         off_m, off_deg = _second_scan(predictions)
-        report.row("mapping", "the second real scan on the map of the first", p50_m=percentile(off_m, 0.5),
-                   most_m=off_m[-1], p50_deg=percentile(off_deg, 0.5), most_deg=off_deg[-1])  # fmt: skip
+        report.row("mapping", "the second real scan on the map of the first", p50_cm=100 * percentile(off_m, 0.5),
+                   most_cm=100 * off_m[-1], p50_deg=percentile(off_deg, 0.5), most_deg=off_deg[-1],
+                   counted_refused=predictions - len(off_m))  # fmt: skip
     for name, options in (("wheels and matching", MapperOptions()), ("wheels alone", _NOTHING_MATCHES)):
         made = [drive(seed, options) for seed in range(drives)]
-        pose_m, map_m = sorted(each[0] for each in made), sorted(each[1] for each in made)
-        report.row(f"mapping, drives of {DRIVE_S:.0f} s", name, median_pose_off_m=percentile(pose_m, 0.5),
-                   most_pose_off_m=pose_m[-1], median_map_off_m=percentile(map_m, 0.5), most_map_off_m=map_m[-1],
-                   scans_refused=float(sum(each[2] for each in made)))  # fmt: skip
+        pose_cm, map_cm = sorted(100 * each[0] for each in made), sorted(100 * each[1] for each in made)
+        report.row(f"mapping, drives of {DRIVE_S:.0f} s", name, pose_off_p50_cm=percentile(pose_cm, 0.5),
+                   pose_off_most_cm=pose_cm[-1], map_off_p50_cm=percentile(map_cm, 0.5), map_off_most_cm=map_cm[-1],
+                   counted_refused=sum(each[2] for each in made))  # fmt: skip
 
 
 def drive(seed: int, options: MapperOptions, seconds: float = DRIVE_S) -> tuple[float, float, int]:
@@ -143,6 +146,7 @@ def _timed(report: Report, of: str, clouds: Sequence[tuple[Pose, Cloud]], option
 
 
 def _second_scan(predictions: int) -> tuple[list[float], list[float]]:
+    """How far off the scans that fitted are, in order [m, degrees]."""
     first, second = (obstacle_scan(cloud, REAL) for cloud in _real_clouds())
     assert isinstance(first, ObstacleScan) and isinstance(second, ObstacleScan)
     mapper, draw = Mapper(GRID), np.random.default_rng(1)
@@ -153,8 +157,9 @@ def _second_scan(predictions: int) -> tuple[list[float], list[float]]:
         east_m, north_m, yaw_rad = (draw.uniform(-1, 1, 3) * (0.25, 0.25, 0.15)).tolist()
         prediction = (B_ON_A[0] + east_m, B_ON_A[1] + north_m, B_ON_A[2] + yaw_rad)
         found = match(GRID, cells >= _OCCUPIED_PERCENT, cells != UNKNOWN, prediction, ends)
-        off_m.append(math.dist(found.pose[:2], B_ON_A[:2]) if isinstance(found, Match) else math.inf)
-        off_deg.append(math.degrees(abs(found.pose[2] - B_ON_A[2])) if isinstance(found, Match) else math.inf)
+        if isinstance(found, Match):
+            off_m.append(math.dist(found.pose[:2], B_ON_A[:2]))
+            off_deg.append(math.degrees(abs(found.pose[2] - B_ON_A[2])))
     return sorted(off_m), sorted(off_deg)
 
 

@@ -15,6 +15,7 @@ from sern_navigation.scan import (
     Refused,
     ScanOptions,
     Unusable,
+    _sectors_of,
     bin_edges_m,
     obstacle_scan,
     planar_scan,
@@ -328,3 +329,16 @@ def test_bins_reach_as_far_as_a_scan(range_max_m: float) -> None:
 def test_options_that_do_not_fit_are_refused(change: dict[str, Any]) -> None:
     with pytest.raises(UsageError):
         ScanOptions(**change)
+
+
+@pytest.mark.parametrize("sectors", [8, 360, 3600])
+def test_the_sectors_of_places_are_those_of_arctan2(sectors: int) -> None:
+    draw = np.random.default_rng(sectors)
+    bearings = draw.uniform(-np.pi, np.pi, 50_000)
+    borders = draw.integers(0, sectors, 10_000)
+    bearings[: len(borders)] = borders * (2 * np.pi / sectors) - np.pi
+    ranges_m = draw.uniform(0.01, 1e4, len(bearings))
+    x, y = (ranges_m * np.cos(bearings)).astype(np.float32), (ranges_m * np.sin(bearings)).astype(np.float32)
+    x[-6:], y[-4:] = (0, 0, 3, -3, 0, -0.0), (0, -0.0, 0, 0)
+    turns = (np.arctan2(y, x) + np.float32(np.pi)) * np.float32(sectors / (2 * np.pi))
+    assert (_sectors_of(x, y, sectors) == np.floor(turns).astype(np.intp) % sectors).all()
