@@ -8,7 +8,7 @@ its business. All calls happen on the event-loop thread; an endpoint with thread
 from collections import Counter
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, runtime_checkable
 
 from sern_core.site.object_mirror import ObjectListener
 from sern_core.vocabulary.message import TopicInfo
@@ -287,6 +287,57 @@ class ShowingEndpoint(Protocol):
         """What says in words how the link is now."""
 
     def show_scene(self, scene: SceneShown) -> None: ...
+
+
+class TopicNews(NamedTuple):
+    """How a topic of another site fares here, by its local name. `age_s`: how old its newest message is now, since its
+    origin took it and without comparing clocks; None: none has come. `dropped`: its messages that did not come, by
+    reason, since the client started."""
+
+    name: TopicName
+    age_s: float | None
+    dropped: Mapping[DropReason, int]
+
+
+class Viewed(Protocol):
+    """What other sites have, for people who look at some of it. All of it on the event loop."""
+
+    def want(self, name: TopicName, wanted: bool) -> None:
+        """Somebody looks at a topic that was offered, by its local name, or nobody does any more. What is wanted is
+        subscribed to over the link, and comes through `advertise` as every other topic."""
+
+    def topics(self) -> Sequence[TopicNews]:
+        """Of the topics that come here now."""
+        ...
+
+
+@runtime_checkable
+class ViewingEndpoint(Protocol):
+    """An endpoint at which people look at some of what there is, and nothing else need come."""
+
+    def use_viewed(self, viewed: Viewed) -> None:
+        """Once, before `start`."""
+
+    def topic_offered(self, info: TopicInfo) -> None:
+        """Another site has this topic, local name in `info`; again when it is described otherwise."""
+
+    def topic_withdrawn(self, name: TopicName) -> None:
+        """It is gone; nobody need say that it is not wanted any more."""
+
+
+@runtime_checkable
+class ViewingMembers(Protocol):
+    """An endpoint of several, at some of which people look."""
+
+    @property
+    def viewers(self) -> Sequence[ViewingEndpoint]: ...
+
+
+def viewers_of(endpoint: Endpoint) -> Sequence[ViewingEndpoint]:
+    """Everything in an endpoint at which people look."""
+    if isinstance(endpoint, ViewingMembers):
+        return endpoint.viewers
+    return [endpoint] if isinstance(endpoint, ViewingEndpoint) else []
 
 
 KeptUpTo = Callable[[int, Mapping[int, DropReason]], None]

@@ -25,6 +25,7 @@ from sern_client.endpoints.base import (
     Sink,
     Subscription,
     TopicEvents,
+    ViewingEndpoint,
     publisher_within,
 )
 from sern_client.endpoints.conversion import Converter, serve
@@ -288,6 +289,11 @@ class CompositeEndpoint:
     def keepers(self) -> list[KeepingEndpoint]:
         """The members that keep messages."""
         return [member for member in self._members if isinstance(member, KeepingEndpoint)]
+
+    @property
+    def viewers(self) -> list[ViewingEndpoint]:
+        """The members at which people look."""
+        return [member for member in self._members if isinstance(member, ViewingEndpoint)]
 
     @property
     def exhausted(self) -> bool:
