@@ -85,6 +85,8 @@ class ObjectFeed:
         self.sees = sees
         self.kinds = kinds
         self.wants_value = wants_value
+        self.bare = False
+        """The reader wants no value at all: what has another value alone is not even looked at."""
         self._text_of = text_of
         self.channel = link.outgoing.open(object_stream(link.end.name, link.end.boot), first=first, now=now)
         self.untold = 0
@@ -158,13 +160,15 @@ class ObjectFeed:
         return not (self._pending or self._open or self.channel.retained) and self._version == self._registry.version
 
     def _poll(self, now: float) -> None:
-        if self._pending or self._open or self._version == self._registry.version:
+        registry = self._registry
+        newest = registry.described_version if self.bare else registry.version
+        if self._pending or self._open or self._version >= newest:
             return
         if now >= self._looked_s + REST_S:
             self._looked_s = now
         elif now > self._looked_s + BURST_S:
             return
-        changes = self._registry.changed(self._version, kinds=self.kinds)
+        changes = registry.changed(self._version, kinds=self.kinds)
         if changes.resync:
             self.restart()
             return

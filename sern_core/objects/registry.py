@@ -89,6 +89,8 @@ class ObjectRegistry:
         self.inline_bytes: int | None = None
         """The largest value that is decoded where it is asked for; None: any."""
         self._version = 0
+        self.described_version = 0
+        """The version of the last change of more than a value."""
         self._entries: dict[str, Entry] = {}
         self._by_kind: dict[ObjectKind, OrderedDict[str, Entry]] = {  # least recently changed first
             kind: OrderedDict() for kind in ObjectKind
@@ -163,7 +165,7 @@ class ObjectRegistry:
             entry.ros_stamp_ns = ros_stamp_ns
         entry.wall_ns = wall_ns
         self._touch(entry, now)
-        entry.described = entry.version
+        entry.described = self.described_version = entry.version
         return self._seen(entry)
 
     def put_stream(self, stream: StreamInfo, *, wall_ns: int, now: float) -> XrObject:
@@ -208,7 +210,7 @@ class ObjectRegistry:
         entry = self._by_stream.get(stream)
         if entry is not None:
             self._touch(entry, now)
-            entry.described = entry.version
+            entry.described = self.described_version = entry.version
 
     def observe(
         self,
@@ -415,6 +417,7 @@ class ObjectRegistry:
             assert all(entry.kind is kind and entries[entry.id] is entry for entry in some.values()), "a kind"
             assert versions == sorted(set(versions)), "the order of changes"
             assert not versions or versions[-1] <= self._version, "a version from the future"
+            assert all(entry.described <= self.described_version for entry in some.values()), "a later description"
         assert {entry.id for entry in entries.values()} == set().union(*self._owned.values()), "owners"
         assert all(self._owned.values()), "an owner of nothing"
         assert {entry.stream: entry for entry in entries.values() if entry.stream} == self._by_stream, "streams"
@@ -476,6 +479,7 @@ class ObjectRegistry:
         if not owned:
             del self._owned[entry.owner], self._bytes_of[entry.owner]
         self._version += 1
+        self.described_version = self._version
         if len(self._deletions) == self._deletions.maxlen:
             self._forgotten_version = self._deletions[0][0] if self._deletions else self._version
         self._deletions.append((self._version, entry.id, entry.kind))

@@ -286,6 +286,7 @@ class ObjectExchange:
         else:
             feed.kinds, feed.idle = told, False
             feed.restart()
+        feed.bare = not any(want.valued for want in wants)
         feed.pump(now=now)
 
     def _sees(self, client: ClientName, object_id: str, kind: ObjectKind | None) -> bool:
