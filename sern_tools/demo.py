@@ -464,6 +464,7 @@ def demo(
     json: Annotated[Path | None, typer.Option(help="The figures; default OUT/result.json.")] = None,
     html: Annotated[Path | None, typer.Option(help="The report; default OUT/report.html.")] = None,
     picture: Annotated[Path | None, typer.Option(help="The age of the newest pose over time, as a PNG file.")] = None,
+    view: Annotated[str | None, typer.Option(help="Keep it running for a viewer of this kind: foxglove.")] = None,
     no_baseline: Annotated[bool, typer.Option("--no-baseline", help="Leave out the run over plain ZMQ.")] = False,
     keep: Annotated[bool, typer.Option("--keep", help="Keep configuration, keys and logs in OUT.")] = False,
 ) -> None:
@@ -479,6 +480,10 @@ def demo(
         if picture is not None and find_spec("matplotlib") is None:
             raise ConfigError(f"--picture needs matplotlib: {installing('matplotlib')}")
         scenario = Scenario(link, duration or link.duration_s, overload=overload, seed=seed, bag=bag)
+        if view is not None:
+            from sern_tools import demo_view  # which is made of this module
+
+            asyncio.run(demo_view.look(demo_view.ViewOptions(view, scenario, profiles, out, keep), console))
         options = Options(
             scenario=scenario,
             out=out,
