@@ -17,8 +17,9 @@ import zmq
 def position_m(body: bytes) -> tuple:
     """x, y, z of the pose. ValueError or struct.error for bytes that are neither of the two types.
 
-    A body begins with four bytes (the seq in ROS 1, the encapsulation in ROS 2), the stamp in eight, and frame_id behind
-    its length in four. In ROS 2 a string ends in NUL, and a value stands at a multiple of its size, counted from byte 4.
+    A body begins with four bytes (the seq in ROS 1, the encapsulation in ROS 2), the stamp in eight, and frame_id
+    behind its length in four. In ROS 2 a string ends in NUL, and a value stands at a multiple of its size, counted
+    from byte 4.
     """
     at = 16 + struct.unpack_from("<I", body, 12)[0]
     ros2 = body[:2] == b"\0\1" and at > 16 and body[at - 1 : at] == b"\0"  # a seq of ROS 1 may be those two bytes, too
