@@ -5,7 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -70,8 +70,20 @@ def compiled(directory: Path, *more: str | Path) -> list[str]:
     return ["mono", str(target)]
 
 
-def over_libzmq(directory: Path) -> tuple[list[str], dict[str, str]]:
-    """Feed.cs over the stand-in for NetMQ: its command, and the environment in which it finds the libzmq of pyzmq."""
+class Prepared(NamedTuple):
+    """How to start a program: its command, and what its environment has beside that of the tests."""
+
+    command: list[str]
+    environment: dict[str, str]
+
+
+def over_python(_directory: Path) -> Prepared:
+    """feed.py."""
+    return Prepared([sys.executable, "-I", str(PLAIN / "feed.py")], {})
+
+
+def over_libzmq(directory: Path) -> Prepared:
+    """Feed.cs over the stand-in for NetMQ, which finds the libzmq of pyzmq."""
     need_mono()
     assert zmq.zmq_version()  # it is loaded
     mapped = (line.split()[-1] for line in Path("/proc/self/maps").read_text().splitlines() if "/libzmq" in line)
@@ -79,16 +91,24 @@ def over_libzmq(directory: Path) -> tuple[list[str], dict[str, str]]:
     if library is None:
         pytest.skip("pyzmq has its libzmq built in, where no other program finds it")
     (directory / "libzmq.so").symlink_to(library)
-    return compiled(directory, STAND_IN), {"LD_LIBRARY_PATH": f"{directory}:{library.parent}"}
+    return Prepared(compiled(directory, STAND_IN), {"LD_LIBRARY_PATH": f"{directory}:{library.parent}"})
 
 
-def over_netmq(directory: Path) -> tuple[list[str], dict[str, str]]:
+def over_netmq(directory: Path) -> Prepared:
     """Feed.cs over NetMQ itself."""
     need_mono()
     place = Path(os.environ.get(NETMQ, ""))
     if not (place / "NetMQ.dll").is_file():
         pytest.skip(f"no NetMQ: {NETMQ} names no folder with NetMQ.dll, AsyncIO.dll and NaCl.dll for .NET Framework")
-    return compiled(directory, f"-r:{place / 'NetMQ.dll'}"), {"MONO_PATH": str(place)}
+    return Prepared(compiled(directory, f"-r:{place / 'NetMQ.dll'}"), {"MONO_PATH": str(place)})
+
+
+PROGRAMS: Final[Mapping[str, Callable[[Path], Prepared]]] = {
+    "python": over_python,
+    "libzmq": over_libzmq,
+    "netmq": over_netmq,
+}
+"""Each makes what it needs in a folder, and skips the test where that cannot be."""
 
 
 class Program:
@@ -111,21 +131,17 @@ class Program:
 
 
 @contextmanager
-def running(kind: str, directory: Path, address: str, topic: str) -> Iterator[Program]:
-    """Start `python` (feed.py), `libzmq` or `netmq` (Feed.cs over one of them), and end it with the block."""
-    environment: dict[str, str] = {}
-    command = [sys.executable, "-I", str(PLAIN / "feed.py")]
-    if kind != "python":
-        command, environment = {"libzmq": over_libzmq, "netmq": over_netmq}[kind](directory)
+def running(prepared: Prepared, directory: Path, address: str, topic: str) -> Iterator[Program]:
+    """Start a program, and end it with the block. What it prints is in printed.txt."""
     output = directory / "printed.txt"
     with (
         output.open("wb") as stream,
         child(
-            [*command, address, topic],
+            [*prepared.command, address, topic],
             stdin=subprocess.DEVNULL,
             stdout=stream,
             stderr=subprocess.STDOUT,
-            env=os.environ | environment,
+            env=os.environ | prepared.environment,
         ) as process,
     ):
         yield Program(process, output)
