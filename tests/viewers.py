@@ -187,6 +187,10 @@ class Bridge(NamedTuple):
     def port(self) -> int:
         return self.endpoint.port
 
+    async def looked_at(self, topic: str, count: int = 1) -> None:
+        """Wait until so many viewers look at a topic."""
+        await until(lambda: self.endpoint.looked_at[TopicName(topic)] == count, f"{count} look at {topic}")
+
 
 @asynccontextmanager
 async def bridge(**options: Any) -> AsyncIterator[Bridge]:

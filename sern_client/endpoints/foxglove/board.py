@@ -145,6 +145,11 @@ class Board:
         """How many are open, by topic."""
         return Counter(each.name for shown in self._topics.values() for each in shown.publishers)
 
+    @property
+    def looked_at(self) -> Counter[TopicName]:
+        """How many viewers look at each topic."""
+        return Counter({name: len(shown.watchers) for name, shown in self._topics.items() if shown.watchers})
+
     def __len__(self) -> int:
         return len(self._topics)
 

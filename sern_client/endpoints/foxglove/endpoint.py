@@ -85,6 +85,11 @@ class FoxgloveEndpoint:
         return self._door.port
 
     @property
+    def looked_at(self) -> Counter[TopicName]:
+        """How many viewers look at each topic."""
+        return Counter() if self._board is None else self._board.looked_at
+
+    @property
     def drops(self) -> dict[DropReason, int]:
         """Messages that a slow viewer did not get, and those of viewers that did not go on."""
         total = Counter({DropReason.QUEUE_FULL: self._server.dropped}) + self.shared.dropped
