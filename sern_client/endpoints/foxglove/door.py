@@ -115,7 +115,13 @@ class _Arrival(asyncio.Protocol):
             return
         self._received = bytearray(request.rest)
         assert self._transport is not None
-        self._viewer = Viewer(self.peer, self._transport, self._door.shared, max_waiting_bytes=self._door.max_bytes)
+        self._viewer = Viewer(
+            self.peer,
+            self._transport,
+            self._door.shared,
+            protocol=handshake.protocols_of(request)[0],
+            max_waiting_bytes=self._door.max_bytes,
+        )
         self._door.shared.viewers.add(self._viewer)
         self._joining = self._door.begin(self._join(self._viewer, request))
 

@@ -9,7 +9,11 @@ from typing import Final, NamedTuple
 from urllib.parse import parse_qs, urlsplit
 
 MAX_HEAD_BYTES: Final = 16_384
-_PASSED_ON: Final = ("sec-websocket-key", "sec-websocket-version", "sec-websocket-protocol")
+_PASSED_ON: Final = ("sec-websocket-key", "sec-websocket-version")
+SPOKEN: Final = "foxglove.sdk.v1"
+"""The subprotocol of the SDK's server, which takes no other."""
+PROTOCOLS: Final = (SPOKEN, "foxglove.websocket.v1")
+"""What a viewer may call it: Lichtblick has the older name, and says and reads the same."""
 _DESKTOP: Final = frozenset({"file", "app", "vscode-file"})
 """Schemes of the pages that applications bring along. No page of the web can have one of them."""
 _END: Final = b"\r\n\r\n"
@@ -95,6 +99,8 @@ def check(request: Request, rules: Rules) -> None:
             HTTPStatus.UPGRADE_REQUIRED,
             "this port speaks the Foxglove WebSocket protocol: open it in Foxglove or Lichtblick, not in a browser",
         )
+    if not protocols_of(request):
+        raise _bad(f"no protocol that is spoken here: {' or '.join(PROTOCOLS)}")
     given = parse_qs(request.target.partition("?")[2]).get("token", [""])[-1]
     if rules.token is not None:
         if not hmac.compare_digest(given.encode(), rules.token.encode()):
@@ -112,9 +118,16 @@ def check(request: Request, rules: Rules) -> None:
         )
 
 
+def protocols_of(request: Request) -> list[str]:
+    """The names that a viewer has for the protocol."""
+    offered = request.headers.get("sec-websocket-protocol", "").split(",")
+    return [protocol for name in offered if (protocol := name.strip()) in PROTOCOLS]
+
+
 def passed_on(request: Request, host: str) -> bytes:
     """The request as the server behind this gets it: what it needs and nothing else, no token above all."""
     lines = [f"GET / HTTP/1.1\r\nHost: {host}\r\nUpgrade: websocket\r\nConnection: Upgrade"]
+    lines.append(f"sec-websocket-protocol: {SPOKEN}")
     lines += [f"{name}: {request.headers[name]}" for name in _PASSED_ON if name in request.headers]
     return "\r\n".join(lines).encode() + _END
 
@@ -123,6 +136,11 @@ def answered(received: bytes) -> tuple[bytes, bytes] | None:
     """The head of the server's answer and what came behind it; None: not all of it has come."""
     head, end, rest = received.partition(_END)
     return (head + end, rest) if end else None
+
+
+def renamed(head: bytes, protocol: str) -> bytes:
+    """The answer with the protocol called as the viewer calls it."""
+    return head.replace(SPOKEN.encode(), protocol.encode())
 
 
 def accepted(head: bytes) -> bool:

@@ -55,9 +55,11 @@ class Owner(Protocol):
 
 
 class Viewer:
-    """From its admission to its end. `transport`: the viewer's own."""
+    """From its admission to its end. `transport`: the viewer's own. `protocol`: what it calls the one that is spoken."""
 
-    def __init__(self, peer: str, transport: asyncio.Transport, owner: Owner, *, max_waiting_bytes: int) -> None:
+    def __init__(
+        self, peer: str, transport: asyncio.Transport, owner: Owner, *, protocol: str, max_waiting_bytes: int
+    ) -> None:
         self.peer = peer
         self.closed = False
         self.ready = False
@@ -67,6 +69,7 @@ class Viewer:
         self.dropped: Counter[int] = Counter()
         """Messages of topics that it did not get, by channel id."""
         self._channels: set[int] = set()
+        self._protocol = protocol
         self._transport = transport
         self._owner = owner
         self._server: asyncio.Transport | None = None
@@ -136,7 +139,7 @@ class Viewer:
                 return
             head, data = answer
             self._answer.clear()
-            self._transport.write(head)
+            self._transport.write(handshake.renamed(head, self._protocol))
             if not handshake.accepted(head):
                 self._transport.write(data)
                 self.close()
