@@ -12,7 +12,7 @@ from sern_client.endpoints.base import ServiceInfo
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import TopicName
 
-DEADLINE_S: Final = 8.0
+DEADLINE_S: Final = 240.0
 """Long enough for a machine that is busy with much else; reached only when something is broken."""
 LASTING: Final[set[str]] = set()
 """What a library keeps open until its process ends, by design: no test is to blame for it."""

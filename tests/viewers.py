@@ -1,4 +1,4 @@
-"""Viewers for tests: a person's Foxglove, as far as the protocol goes, over real websockets; and a client to look at."""
+"""Viewers for tests, over real websockets: a person's Foxglove, as far as the protocol goes. And what they look at."""
 
 import asyncio
 import json
@@ -39,11 +39,13 @@ class FakeViewed:
     def __init__(self) -> None:
         self.wants: list[tuple[str, bool]] = []
         self.news: dict[str, TopicNews] = {}
+        self.asked = 0
 
     def want(self, name: TopicName, wanted: bool) -> None:
         self.wants.append((name, wanted))
 
     def topics(self) -> Sequence[TopicNews]:
+        self.asked += 1
         return list(self.news.values())
 
     def set(self, name: str, age_s: float | None, **dropped: int) -> None:

@@ -67,7 +67,7 @@ class Server:
         import foxglove
         from foxglove.websocket import Capability
 
-        # It says who connects, and each thing that is wrong with what they send: the door counts that, and says it once.
+        # It says who connects, and whatever is wrong with what they send: the door counts that, and says it once.
         logging.getLogger(foxglove.__name__).setLevel(logging.CRITICAL)
         self._handover = Handover(asyncio.get_running_loop(), max_bytes=HANDED_OVER_BYTES)
         self._context = foxglove.Context()

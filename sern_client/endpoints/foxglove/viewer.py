@@ -55,7 +55,7 @@ class Owner(Protocol):
 
 
 class Viewer:
-    """From its admission to its end. `transport`: the viewer's own. `protocol`: what it calls the one that is spoken."""
+    """From its admission to its end. `transport`: its own. `protocol`: what it calls the one that is spoken."""
 
     def __init__(
         self, peer: str, transport: asyncio.Transport, owner: Owner, *, protocol: str, max_waiting_bytes: int

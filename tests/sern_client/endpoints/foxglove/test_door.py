@@ -16,9 +16,8 @@ from cryptography.x509.oid import NameOID
 from sern_client.endpoints.foxglove import door, handshake
 from sern_client.endpoints.foxglove.handshake import Turned
 from sern_core.vocabulary.errors import ConfigError
-from sern_runtime.config.client import load_client
+from sern_runtime.config.client import ClientFile, load_client
 from sern_runtime.config.load import check
-from sern_runtime.config.client import ClientFile
 from tests.support import until
 from tests.viewers import bridge, head, viewer
 
