@@ -1,0 +1,271 @@
+"""One viewer: what it sends passes on to the server when it is sound, and what it gets waits here, within bounds.
+
+The server keeps what it has for a viewer by number of messages, the oldest of which it drops without telling anybody.
+So all that it has is taken from it at once, and what a slow viewer does not take waits here: bounded in bytes and time,
+and dropped with a reason. What is no message of a topic is never dropped; a viewer that leaves too much of that is cut.
+"""
+
+import asyncio
+import socket
+from collections import Counter, deque
+from contextlib import suppress
+from typing import Any, Final, NamedTuple, Protocol, TypeGuard, cast
+
+from sern_client.endpoints.common.queue import BoundedQueue
+from sern_client.endpoints.foxglove import frames, handshake
+from sern_client.endpoints.foxglove.frames import Fault, Frame, FrameError, Heard, Said
+from sern_core.vocabulary.types import DropReason
+from sern_runtime import clock
+
+WAIT_S: Final = 1.0
+"""A topic's message that a viewer has not begun to take after so long is of no use to who looks at what is now."""
+MUST_BYTES: Final = 32 * 2**20
+"""What must not be dropped and waits for a viewer: beyond, it is cut."""
+SOCKET_BYTES: Final = 2**18
+"""What waits in this process and in the system behind a message that has its turn: more would only make it late."""
+MAX_SUBSCRIPTIONS: Final = 20_000
+FLUSH_S: Final = 1.0
+"""How long a viewer has to take what was said last."""
+
+
+class _Waiting(NamedTuple):
+    wire: bytes
+    subscription: int
+    until_s: float
+
+
+class Owner(Protocol):
+    """What a viewer is to know of the whole, and whom it tells."""
+
+    dropped: Counter[DropReason]
+
+    def keeps(self, channel: int) -> bool:
+        """Whether each message of a channel must arrive: its last one holds until there is another."""
+
+    def subscribed(self, viewer: "Viewer", subscription: int, channel: int) -> None:
+        """A viewer has asked for a channel."""
+
+    def fault(self, fault: Fault, problem: str) -> None:
+        """Count something that a viewer sent, and say it."""
+
+    def behind(self, viewer: "Viewer") -> None:
+        """It takes less than what comes; told once until it has caught up."""
+
+    def gone(self, viewer: "Viewer") -> None: ...
+
+
+class Viewer:
+    """From its admission to its end. `transport`: its own. `protocol`: what it calls the one that is spoken."""
+
+    def __init__(
+        self, peer: str, transport: asyncio.Transport, owner: Owner, *, protocol: str, max_waiting_bytes: int
+    ) -> None:
+        self.peer = peer
+        self.closed = False
+        self.ready = False
+        """The server has answered, so something may be said to it."""
+        self.subscriptions: dict[int, int] = {}
+        """Channel ids by the viewer's own numbers, those that it says it has."""
+        self.dropped: Counter[int] = Counter()
+        """Messages of topics that it did not get, by channel id."""
+        self._channels: set[int] = set()
+        self._protocol = protocol
+        self._transport = transport
+        self._owner = owner
+        self._server: asyncio.Transport | None = None
+        self._heard = Heard()
+        self._said = Said()
+        self._answer = bytearray()
+        self._paused = False
+        self._behind = False
+        self._waiting: BoundedQueue[_Waiting] = BoundedQueue(max_bytes=max_waiting_bytes)
+        self._must: deque[bytes] = deque()
+        self._must_bytes = 0
+        transport.set_write_buffer_limits(high=SOCKET_BYTES)
+        _set(transport, socket.SOL_SOCKET, socket.SO_SNDBUF, SOCKET_BYTES)
+        _set(transport, socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+
+    def joined(self, server: asyncio.Transport) -> None:
+        """The connection to the server behind it is there."""
+        self._server = server
+
+    # --- from the viewer --------------------------------------------------------------------------------------------
+
+    def hear(self, data: bytes) -> None:
+        if self.closed or self._server is None:
+            return
+        try:
+            spoken = self._heard.feed(data)
+        except FrameError as error:
+            self._owner.fault(error.fault, f"{self.peer} is cut: {error}")
+            self.cut(error.code, str(error))
+            return
+        self._server.write(data)
+        for each in spoken:
+            if each.problem:  # the server tells it so
+                self._owner.fault(Fault.CONTENT, f"{self.peer} sent {each.problem}")
+            elif each.said["op"] == "subscribe":
+                self._subscribes(each.said.get("subscriptions"))
+            elif each.said["op"] == "unsubscribe":
+                self._unsubscribes(each.said.get("subscriptionIds"))
+
+    def _subscribes(self, listed: Any) -> None:
+        for each in listed if isinstance(listed, list) else ():
+            number, channel = (each.get("id"), each.get("channelId")) if isinstance(each, dict) else (None, None)
+            if not (_is_id(number) and _is_id(channel)) or number in self.subscriptions:
+                continue
+            if len(self.subscriptions) < MAX_SUBSCRIPTIONS and channel not in self._channels:
+                self.subscriptions[number] = channel
+                self._channels.add(channel)
+                self._owner.subscribed(self, number, channel)
+
+    def _unsubscribes(self, listed: Any) -> None:
+        for number in listed if isinstance(listed, list) else ():
+            if _is_id(number):
+                self._channels.discard(self.subscriptions.pop(number, -1))
+
+    # --- to the viewer ----------------------------------------------------------------------------------------------
+
+    def say(self, data: bytes) -> None:
+        """What the server has for it."""
+        if self.closed:
+            return
+        if not self.ready:
+            self._answer += data
+            answer = handshake.answered(bytes(self._answer))
+            if answer is None:
+                if len(self._answer) > handshake.MAX_HEAD_BYTES:
+                    self.close()
+                return
+            head, data = answer
+            self._answer.clear()
+            self._transport.write(handshake.renamed(head, self._protocol))
+            if not handshake.accepted(head):
+                self._transport.write(data)
+                self.close()
+                return
+            self.ready = True
+        for each in self._said.feed(data):
+            self._send(each)
+
+    def tell(self, said: dict[str, Any]) -> None:
+        """Say something of our own to this viewer alone."""
+        if self.ready and not self.closed:
+            self._send(Frame(frames.text_frame(said), None))
+
+    def show(self, subscription: int, stamp_ns: int, body: bytes) -> None:
+        """A message for this viewer alone, which must arrive."""
+        if self.ready and not self.closed:
+            self._send(Frame(frames.message_frame(subscription, stamp_ns, body), None))
+
+    def _send(self, each: Frame) -> None:
+        if not self._paused and not self._must and not len(self._waiting):
+            self._transport.write(each.wire)
+            return
+        if each.subscription is None or self._owner.keeps(self.subscriptions.get(each.subscription, -1)):
+            self._must.append(each.wire)
+            self._must_bytes += len(each.wire)
+            if self._must_bytes > MUST_BYTES:
+                self._owner.fault(Fault.SLOW, f"{self.peer} is cut: it takes nothing of what must arrive")
+                self.cut(frames.AGAIN_LATER, "too slow")
+            return
+        if not self._behind and len(self._waiting):
+            self._behind = True
+            self._owner.behind(self)
+        waiting = _Waiting(each.wire, each.subscription, clock.now() + WAIT_S)
+        for dropped in self._waiting.put(waiting, len(each.wire)):
+            self._drop(DropReason.QUEUE_FULL, dropped)
+
+    def pause(self) -> None:
+        """Its connection takes nothing more now."""
+        self._paused = True
+
+    def resume(self) -> None:
+        """Its connection takes something again: what must arrive first."""
+        self._paused = False
+        now = clock.now()
+        while self._must and not self._paused:
+            wire = self._must.popleft()
+            self._must_bytes -= len(wire)
+            self._transport.write(wire)
+        while len(self._waiting) and not self._paused:
+            waiting = self._waiting.pop()
+            if waiting.until_s < now:
+                self._drop(DropReason.LIFESPAN, waiting)
+            else:
+                self._transport.write(waiting.wire)
+        if not self._paused:
+            self._behind = False
+
+    def _drop(self, why: DropReason, waiting: _Waiting) -> None:
+        self._owner.dropped[why] += 1
+        self.dropped[self.subscriptions.get(waiting.subscription, -1)] += 1
+
+    # --- its end ----------------------------------------------------------------------------------------------------
+
+    def cut(self, code: int, why: str) -> None:
+        """End it, and tell it why where it can be told."""
+        if not self.closed and self.ready and not self._paused:
+            self._transport.write(frames.close_frame(code, why))
+        self.close()
+
+    def close(self) -> None:
+        if self.closed:
+            return
+        self.closed = True
+        while len(self._waiting):
+            self._drop(DropReason.DISCONNECTED, self._waiting.pop())
+        self._must.clear()
+        self._must_bytes = 0
+        if self._server is not None:
+            self._server.abort()
+        if self._paused:
+            self._transport.abort()  # it would wait for who takes nothing
+        else:
+            self._transport.close()
+            asyncio.get_running_loop().call_later(FLUSH_S, self._transport.abort)
+        self._owner.gone(self)
+
+    def hold(self, *, held: bool) -> None:
+        """Whether the server takes what the viewer sends."""
+        with suppress(RuntimeError):  # it is closing
+            (self._transport.pause_reading if held else self._transport.resume_reading)()
+
+
+class ServerSide(asyncio.Protocol):
+    """The connection from a viewer to the server behind the door."""
+
+    def __init__(self, viewer: Viewer) -> None:
+        self._viewer = viewer
+        self._transport: asyncio.Transport | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast("asyncio.Transport", transport)
+        self._viewer.joined(self._transport)
+
+    def data_received(self, data: bytes) -> None:
+        # The server sends with Nagle's algorithm: what it has next waits until we have confirmed what came.
+        assert self._transport is not None
+        _set(self._transport, socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
+        self._viewer.say(data)
+
+    def pause_writing(self) -> None:
+        self._viewer.hold(held=True)
+
+    def resume_writing(self) -> None:
+        self._viewer.hold(held=False)
+
+    def connection_lost(self, error: Exception | None) -> None:
+        self._viewer.close()
+
+
+def _is_id(value: object) -> TypeGuard[int]:
+    return type(value) is int and 0 <= value < 1 << 32
+
+
+def _set(transport: asyncio.Transport, level: int, option: int, value: int) -> None:
+    """Best effort: a connection that is closing takes none, and a test's transport has no socket."""
+    found = transport.get_extra_info("socket")
+    if found is not None:
+        with suppress(OSError):
+            found.setsockopt(level, option, value)
