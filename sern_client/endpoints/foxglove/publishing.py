@@ -46,11 +46,13 @@ class _Published:
 
 @dataclass(frozen=True, slots=True)
 class _Writer:
-    """A viewer's channel. `topic` None: it was refused."""
+    """A viewer's channel. `topic` None: it was refused, and `refused` says why. The viewer is told when it sends
+    something: a 3D panel announces goals as soon as it is open."""
 
     name: str
     topic: _Published | None
     json: bool = False
+    refused: "_RefusedError | None" = None
 
 
 class _RefusedError(Exception):
@@ -100,19 +102,13 @@ class Publishing:
         try:
             topic = self._topic(said)
         except _RefusedError as error:
-            text = f"{said.topic[:255]} is not published: {error}"
-            self._fault(error.fault, f"a viewer is told: {text}")
-            self._news.say(_status(said.topic), text)
-            self._writers[key] = _Writer(said.topic, None)
+            self._writers[key] = _Writer(said.topic, None, refused=error)
             return
         self._writers[key] = _Writer(said.topic, topic, json=said.encoding == JSON)
         topic.writers.add(key)
         if len(topic.writers) == 1:
             self._events.topic_added(topic.info)
             _log.info("viewers publish %s (%s)", topic.info.name, topic.info.type_name)
-        if not topic.subscriptions:
-            text = f"{said.topic}: nothing of this site's file sends it, so it stays here"
-            self._news.say(_status(said.topic), text, WARNING)
 
     def unadvertised(self, client: int, number: int) -> None:
         """A viewer publishes there no more."""
@@ -133,6 +129,11 @@ class Publishing:
         writer = self._writers.get((client, number))
         if writer is None or writer.topic is None:
             self.dropped[DropReason.UNKNOWN_CHANNEL] += 1
+            if writer is not None and writer.refused is not None:
+                text = f"{writer.name[:255]} is not published: {writer.refused}"
+                self._fault(writer.refused.fault, f"a viewer is told: {text}")
+                self._news.say(_status(writer.name), text)
+                self._writers[client, number] = _Writer(writer.name, None)  # it is told once
             return
         topic = writer.topic
         if writer.json:
@@ -146,6 +147,8 @@ class Publishing:
                 return
         if not topic.subscriptions:
             self.dropped[DropReason.UNWANTED] += 1
+            text = f"{writer.name}: nothing of this site's file sends it, so it stays here"
+            self._news.say(_status(writer.name), text, WARNING)
         stamp_ns = time.time_ns()
         for subscription in list(topic.subscriptions):
             if not subscription.sink(body, stamp_ns):

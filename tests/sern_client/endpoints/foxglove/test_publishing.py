@@ -83,8 +83,8 @@ async def test_a_type_that_comes_with_its_definition() -> None:
 async def test_an_unknown_type_is_told_and_the_bridge_goes_on() -> None:
     async with bridge(publish=True) as run, viewer(run.port) as person:
         await person.advertise(1, "/own", "own_msgs/Thing")
-        await told(person, "/own", "own_msgs/msg/Thing is unknown here")
         await person.publish(1, b"{}")
+        await told(person, "/own", "own_msgs/msg/Thing is unknown here")
         await until(lambda: run.endpoint.drops == {DropReason.UNKNOWN_CHANNEL: 1})
         assert run.endpoint.shared.faults[Fault.TYPE] == 1 and not run.events.added
         await person.say({"op": "unadvertise", "channelIds": [1]})
@@ -106,6 +106,7 @@ async def test_an_unknown_type_is_told_and_the_bridge_goes_on() -> None:
 async def test_what_may_not_be_published(topic: str, type_name: str, encoding: str, said: str) -> None:
     async with bridge(publish=("/?cmd_vel",)) as run, viewer(run.port) as person:
         await person.advertise(1, topic, type_name, encoding, schema="x", schemaEncoding="ros2msg")
+        await person.publish(1, b"{}")
         await told(person, topic, said)
         assert not run.events.added
 
@@ -146,6 +147,7 @@ async def test_two_viewers_with_one_topic() -> None:
             await second.publish(1, b"{}")
             await until(lambda: len(sink.got) == 1)
             await second.advertise(2, CMD, "std_msgs/String")
+            await second.publish(2, b"{}")
             await told(second, CMD, "another viewer publishes it as geometry_msgs/msg/Twist")
         await first.publish(1, b"{}")
         await until(lambda: len(sink.got) == 2)
@@ -155,8 +157,8 @@ async def test_two_viewers_with_one_topic() -> None:
 async def test_what_nobody_sends_and_what_is_refused() -> None:
     async with bridge(publish=True) as run, viewer(run.port) as person:
         await person.advertise(1, CMD, TWIST)
-        await told(person, CMD, "nothing of this site's file sends it")
         await person.publish(1, b"{}")
+        await told(person, CMD, "nothing of this site's file sends it")
         await until(lambda: run.endpoint.drops == {DropReason.UNWANTED: 1})
         full = Sink(accepts=False)
         subscription = run.endpoint.subscribe(CMD, full)
