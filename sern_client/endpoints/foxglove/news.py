@@ -143,7 +143,7 @@ class News:
             del self._of_viewers[viewer]
 
     def _look_at_link(self, now: float) -> None:
-        topics = {news.name: news.dropped for news in self._topics()}
+        topics = {news.name: _lost(news.dropped) for news in self._topics()}
         for name, dropped in topics.items():
             told = self._of_link.update(name, sum(dropped.values()), now=now)
             if told is not None:
@@ -166,6 +166,11 @@ class News:
 
 def _status(status: str, level: int, text: str) -> dict[str, object]:
     return {"op": "status", "level": level, "message": text, "id": status}
+
+
+def _lost(dropped: Mapping[DropReason, int]) -> dict[DropReason, int]:
+    """Without what came twice: it is counted, and nothing is missing."""
+    return {reason: count for reason, count in dropped.items() if reason != DropReason.DUPLICATE}
 
 
 def _reasons(dropped: Mapping[DropReason, int]) -> str:

@@ -1,5 +1,7 @@
 """What viewers are not told: what is no trouble of theirs."""
 
+from itertools import count
+
 from tests.support import until
 from tests.viewers import bridge, viewer
 
@@ -27,3 +29,18 @@ async def test_what_stays_here_is_told_when_something_is_sent() -> None:
         await looking.publish(1, b"{}")
         await until(lambda: looking.statuses)
         assert "nothing of this site's file sends it" in next(iter(looking.statuses.values()))
+
+
+async def test_what_came_twice_is_not_missing() -> None:
+    async with bridge() as site, viewer(site.port) as looking:
+        counts = count()
+
+        def told() -> bool:
+            number = next(counts)
+            site.viewed.set("/robot/points", 0.1, duplicate=number, lifespan=0)
+            site.viewed.set("/robot/scan", 0.1, duplicate=number, lifespan=number)
+            return bool(looking.statuses)
+
+        await until(told, "of one topic something is missing")
+        (text,) = looking.statuses.values()
+        assert text.startswith("/robot/scan: ") and "lifespan" in text and "duplicate" not in text
