@@ -242,6 +242,9 @@ class Board:
 
     def _renew(self, shown: _Shown, info: TopicInfo) -> None:
         """Describe a topic anew: viewers find another channel of its name, and most ask for it at once."""
+        if definitions.of_topic(info) == definitions.of_topic(shown.info):
+            shown.info = info  # as was known before it was said; and of two such channels the server makes one
+            return
         channel = self._open(info)
         looked_at = shown.wanted
         self._close_channels(shown)
