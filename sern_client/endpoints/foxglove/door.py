@@ -61,8 +61,8 @@ class Shared:
 
     def ended(self, channel: int) -> None:
         """There is no such channel any more. Some viewers never say that they do not look at it."""
-        for viewer in self._looking.pop(channel, {}):
-            viewer.forget(channel)
+        for viewer, subscription in self._looking.pop(channel, {}).items():
+            viewer.forget(subscription, channel)
 
     def unsubscribed(self, viewer: Viewer, channel: int) -> None:
         looking = self._looking.get(channel, {})
@@ -70,13 +70,14 @@ class Shared:
         if not looking:
             self._looking.pop(channel, None)
 
-    def fault(self, fault: Fault, problem: str) -> None:
+    def fault(self, fault: Fault, problem: str, peer: str = "") -> None:
         self.faults[fault] += 1
-        self.say_once(problem)
+        self.say_once(f"{peer} {problem}".strip(), peer.rpartition(":")[0], problem)
 
     def behind(self, viewer: Viewer) -> None:
         self.falls_behind += 1
-        self.say_once(f"{viewer.peer} takes less than what comes: its oldest messages are dropped")
+        problem = "takes less than what comes: its oldest messages are dropped"
+        self.say_once(f"{viewer.peer} {problem}", viewer.peer.rpartition(":")[0], problem)
 
     def gone(self, viewer: Viewer) -> None:
         self.viewers.discard(viewer)
@@ -85,10 +86,6 @@ class Shared:
     def refuse(self, peer: str, error: RefusedError) -> None:
         self.turned[error.why] += 1
         self.say_once(f"{peer.rpartition(':')[0]} was refused: {error}")
-
-    @property
-    def ready(self) -> list[Viewer]:
-        return [viewer for viewer in self.viewers if viewer.ready]
 
 
 class _Arrival(asyncio.Protocol):

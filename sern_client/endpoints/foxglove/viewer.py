@@ -45,8 +45,8 @@ class Owner(Protocol):
 
     def unsubscribed(self, viewer: "Viewer", channel: int) -> None: ...
 
-    def fault(self, fault: Fault, problem: str) -> None:
-        """Count something that a viewer sent, and say it."""
+    def fault(self, fault: Fault, problem: str, peer: str = "") -> None:
+        """Count something that a viewer sent, and say it, once of each host."""
 
     def behind(self, viewer: "Viewer") -> None:
         """It takes less than what comes; told once until it has caught up."""
@@ -97,13 +97,13 @@ class Viewer:
         try:
             spoken = self._heard.feed(data)
         except FrameError as error:
-            self._owner.fault(error.fault, f"{self.peer} is cut: {error}")
+            self._owner.fault(error.fault, f"is cut: {error}", self.peer)
             self.cut(error.code, str(error))
             return
         self._server.write(data)
         for each in spoken:
             if each.problem:  # the server tells it so
-                self._owner.fault(Fault.CONTENT, f"{self.peer} sent {each.problem}")
+                self._owner.fault(Fault.CONTENT, f"sent {each.problem}", self.peer)
             elif each.said["op"] == "subscribe":
                 self._subscribes(each.said.get("subscriptions"))
             elif each.said["op"] == "unsubscribe":
@@ -127,11 +127,11 @@ class Viewer:
                     self._channels.discard(channel)
                     self._owner.unsubscribed(self, channel)
 
-    def forget(self, channel: int) -> None:
+    def forget(self, subscription: int, channel: int) -> None:
         """A channel is no more."""
         self._channels.discard(channel)
         self.dropped.pop(channel, None)
-        self.subscriptions = {number: each for number, each in self.subscriptions.items() if each != channel}
+        self.subscriptions.pop(subscription, None)
 
     # --- to the viewer ----------------------------------------------------------------------------------------------
 
@@ -193,7 +193,7 @@ class Viewer:
         self._must.append(wire)
         self._must_bytes += len(wire)
         if self._must_bytes > MUST_BYTES:
-            self._owner.fault(Fault.SLOW, f"{self.peer} is cut: it takes nothing of what must arrive")
+            self._owner.fault(Fault.SLOW, "is cut: it takes nothing of what must arrive", self.peer)
             self.cut(frames.AGAIN_LATER, "too slow")
 
     def pause(self) -> None:
