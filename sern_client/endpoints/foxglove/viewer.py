@@ -19,8 +19,9 @@ from sern_runtime import clock
 
 WAIT_S: Final = 1.0
 """A topic's message that a viewer has not begun to take after so long is of no use to who looks at what is now."""
-MUST_BYTES: Final = 32 * 2**20
-"""What must not be dropped and waits for a viewer: beyond, it is cut."""
+MUST_BYTES: Final = 128 * 2**20
+"""What must not be dropped and waits for a viewer: beyond, it is cut. Who comes may ask for several large maps at once;
+what waits of them are the very bodies that are kept for all."""
 SOCKET_BYTES: Final = 2**18
 """What waits in this process and in the system behind a message that has its turn: more would only make it late."""
 MAX_SUBSCRIPTIONS: Final = 20_000
@@ -79,7 +80,7 @@ class Viewer:
         self._paused = False
         self._behind = False
         self._waiting: BoundedQueue[_Waiting] = BoundedQueue(max_bytes=max_waiting_bytes)
-        self._must: deque[bytes] = deque()
+        self._must: deque[tuple[bytes, ...]] = deque()
         self._must_bytes = 0
         transport.set_write_buffer_limits(high=SOCKET_BYTES)
         _set(transport, socket.SOL_SOCKET, socket.SO_SNDBUF, SOCKET_BYTES)
@@ -170,7 +171,7 @@ class Viewer:
         if self._free:
             self._transport.writelines([head, body])
         elif must:
-            self._send(head + body)
+            self._send(head, body)
         else:
             if not self._behind and len(self._waiting):
                 self._behind = True
@@ -185,13 +186,13 @@ class Viewer:
         """Whether nothing waits."""
         return not self._paused and not self._must and not len(self._waiting)
 
-    def _send(self, wire: bytes) -> None:
+    def _send(self, *parts: bytes) -> None:
         """What must arrive."""
         if self._free:
-            self._transport.write(wire)
+            self._transport.writelines(parts)
             return
-        self._must.append(wire)
-        self._must_bytes += len(wire)
+        self._must.append(parts)
+        self._must_bytes += sum(map(len, parts))
         if self._must_bytes > MUST_BYTES:
             self._owner.fault(Fault.SLOW, "is cut: it takes nothing of what must arrive", self.peer)
             self.cut(frames.AGAIN_LATER, "too slow")
@@ -205,9 +206,9 @@ class Viewer:
         self._paused = False
         now = clock.now()
         while self._must and not self._paused:
-            wire = self._must.popleft()
-            self._must_bytes -= len(wire)
-            self._transport.write(wire)
+            parts = self._must.popleft()
+            self._must_bytes -= sum(map(len, parts))
+            self._transport.writelines(parts)
         while len(self._waiting) and not self._paused:
             waiting = self._waiting.pop()
             if waiting.until_s < now:
