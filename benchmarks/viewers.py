@@ -2,8 +2,8 @@
 
 Twenty topics with 5 MB/s of clouds, shown to a viewer of Foxglove's protocol in a process of its own on this machine.
 `endpoint` is SERN's endpoint `foxglove`, door and all; `bare server` is foxglove-sdk's own, which is fed with the same
-bodies at the same times. Latency is from the call that hands a body over, as the site does when it has come over the link, until the
-viewer has the whole of it; CPU is that of the process that serves, whose feeding is the same in both.
+bodies at the same times. Latency is from the call that hands a body over, as the site does when it has come over the
+link, until the viewer has the whole of it; CPU is that of the process that serves, whose feeding is the same in both.
 """
 
 import argparse
@@ -224,4 +224,4 @@ def _metrics(seen: Seen, duration_s: float) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    sys.exit(common.main("viewers", run, description=__doc__))
+    sys.exit(common.main("viewers", run, description=__doc__, arguments=common.repetition_arguments))

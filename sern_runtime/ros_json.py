@@ -124,7 +124,10 @@ def _numbers(values: Any, base: str, name: str) -> Any:
         if isinstance(values, bytes):
             return np.frombuffer(values, dtype=np.uint8).copy()
         if dtype.kind == "f":
-            floats = np.array(values, dtype=np.float64).reshape(len(values)).astype(dtype)
+            if any(type(value) not in (int, float) for value in values):
+                raise BodyError(f"{name} has what is no {base}")
+            with np.errstate(over="ignore"):  # what becomes infinite is refused
+                floats = np.array(values, dtype=np.float64).astype(dtype)
             if not np.isfinite(floats).all():
                 raise BodyError(f"{name} has what does not fit into {base}")
             return floats

@@ -37,12 +37,12 @@ _log = logging.getLogger(__name__)
 class Channel(Protocol):
     number: int
 
-    def log(self, body: bytes) -> None: ...
-
     def close(self) -> None: ...
 
 
 OpenChannel = Callable[[TopicInfo, Described], Channel]
+ShowAll = Callable[[int, bytes, bool], None]
+"""`show(channel, body, must)` to all who look. `must`: it holds until there is another."""
 Show = Callable[[int, bytes], None]
 """`show(time_ns, body)` to one viewer."""
 
@@ -79,10 +79,6 @@ class _Shown:
     watchers: set[int] = field(default_factory=set)
     age_watchers: set[int] = field(default_factory=set)
 
-    @property
-    def latched(self) -> bool:
-        return self.static is not None or bool(self.kept) or self.info.latched
-
 
 class TopicPublisher:
     """A `Publisher` of what comes from another site."""
@@ -110,7 +106,7 @@ class TopicPublisher:
         shown = self._shown
         if self._latched:
             self._keep(shown, body)
-        shown.channel.log(body)
+        self._board.show_all(shown.channel.number, body, self._latched)
 
     def _keep(self, shown: _Shown, body: bytes) -> None:
         if shown.static is not None:
@@ -130,7 +126,8 @@ class TopicPublisher:
 class Board:
     """All topics that viewers can look at. `open_channel` makes a channel at the server."""
 
-    def __init__(self, viewed: Viewed, open_channel: OpenChannel) -> None:
+    def __init__(self, viewed: Viewed, open_channel: OpenChannel, show_all: ShowAll) -> None:
+        self.show_all = show_all
         self.dropped: Counter[DropReason] = Counter()
         self.say_once = SayOnce(_log)
         self._viewed = viewed
@@ -316,11 +313,6 @@ class Board:
             shown.wanted = wanted
             self._viewed.want(shown.info.name, wanted)
 
-    def keeps(self, number: int) -> bool:
-        """Whether each message of a channel counts until there is another."""
-        shown = self._by_number.get(number)
-        return shown is not None and shown.channel.number == number and shown.latched
-
     def missed(self, number: int, show: Show) -> None:
         """Show one who has come now what was said before and holds."""
         shown = self._by_number.get(number)
@@ -337,7 +329,7 @@ class Board:
     def _show_age(self, name: TopicName, age_s: float) -> None:
         shown = self._topics.get(name)
         if shown is not None and shown.age is not None and shown.age_info is not None:
-            shown.age.log(age_body(age_s, shown.age_info.encoding))
+            self.show_all(shown.age.number, age_body(age_s, shown.age_info.encoding), False)
 
 
 def _same(mine: TopicInfo, theirs: TopicInfo) -> bool:

@@ -7,7 +7,9 @@ token or where a page is from, and speaks TLS. (Who has an account on this machi
 
 import asyncio
 import logging
+import socket
 import ssl
+import time
 from collections import Counter
 from collections.abc import Callable, Coroutine
 from http import HTTPStatus
@@ -41,23 +43,41 @@ class Shared:
         self.falls_behind = 0
         self.viewers: set[Viewer] = set()
         self.say_once = SayOnce(_log)
-        self.on_keeps: Callable[[int], bool] = lambda _channel: False
+        self._looking: dict[int, dict[Viewer, int]] = {}  # their own numbers, by channel
         self.on_subscribed: Callable[[Viewer, int, int], None] = lambda _viewer, _subscription, _channel: None
         self.on_changed: Callable[[], None] = lambda: None
 
-    def keeps(self, channel: int) -> bool:
-        return self.on_keeps(channel)
+    def show(self, channel: int, body: bytes, *, must: bool) -> None:
+        """Show a message to all who look at a channel. Its time is when it came: clocks of its origins may differ."""
+        looking = self._looking.get(channel)
+        if looking:
+            now_ns = time.time_ns()
+            for viewer, subscription in list(looking.items()):
+                viewer.show(subscription, now_ns, body, must=must)
 
     def subscribed(self, viewer: Viewer, subscription: int, channel: int) -> None:
+        self._looking.setdefault(channel, {})[viewer] = subscription
         self.on_subscribed(viewer, subscription, channel)
 
-    def fault(self, fault: Fault, problem: str) -> None:
+    def ended(self, channel: int) -> None:
+        """There is no such channel any more. Some viewers never say that they do not look at it."""
+        for viewer, subscription in self._looking.pop(channel, {}).items():
+            viewer.forget(subscription, channel)
+
+    def unsubscribed(self, viewer: Viewer, channel: int) -> None:
+        looking = self._looking.get(channel, {})
+        looking.pop(viewer, None)
+        if not looking:
+            self._looking.pop(channel, None)
+
+    def fault(self, fault: Fault, problem: str, peer: str = "") -> None:
         self.faults[fault] += 1
-        self.say_once(problem)
+        self.say_once(f"{peer} {problem}".strip(), peer.rpartition(":")[0], problem)
 
     def behind(self, viewer: Viewer) -> None:
         self.falls_behind += 1
-        self.say_once(f"{viewer.peer} takes less than what comes: its oldest messages are dropped")
+        problem = "takes less than what comes: its oldest messages are dropped"
+        self.say_once(f"{viewer.peer} {problem}", viewer.peer.rpartition(":")[0], problem)
 
     def gone(self, viewer: Viewer) -> None:
         self.viewers.discard(viewer)
@@ -66,10 +86,6 @@ class Shared:
     def refuse(self, peer: str, error: RefusedError) -> None:
         self.turned[error.why] += 1
         self.say_once(f"{peer.rpartition(':')[0]} was refused: {error}")
-
-    @property
-    def ready(self) -> list[Viewer]:
-        return [viewer for viewer in self.viewers if viewer.ready]
 
 
 class _Arrival(asyncio.Protocol):
@@ -128,9 +144,13 @@ class _Arrival(asyncio.Protocol):
     async def _join(self, viewer: Viewer, request: handshake.Request) -> None:
         host, port = self._door.server
         loop = asyncio.get_running_loop()
+        connection = socket.socket()
+        connection.setblocking(False)
         try:
-            server, _ = await loop.create_connection(lambda: ServerSide(viewer), host, port)
+            await loop.sock_connect(connection, self._door.server)
+            server, _ = await loop.create_connection(lambda: ServerSide(viewer, connection), sock=connection)
         except OSError as error:
+            connection.close()
             _log.error("the server behind the door does not answer: %s", error.strerror)
             viewer.close()
             return

@@ -109,10 +109,9 @@ class FoxgloveEndpoint:
         if options.tls_certificate is not None and options.tls_key is not None:
             tls = tls_context(options.tls_certificate, options.tls_key)
         patterns = PatternSet([".*"] if options.publish is True else options.publish or ())
-        board = self._board = Board(self._viewed, self._open_channel)
+        board = self._board = Board(self._viewed, self._open_channel, self._show_all)
         news = self._news = News(lambda: list(self.shared.viewers), self._viewed.topics, board.name_of)
         self._publishing = Publishing(patterns.fullmatch, Encoding(options.encoding), events, news, self.shared.fault)
-        self.shared.on_keeps = board.keeps
         self.shared.on_subscribed = self._subscribed
         self.shared.on_changed = news.viewers_changed
         self._server.start(self, publishes=options.publish not in (False, ()), encodings=ENCODINGS)
@@ -162,11 +161,14 @@ class FoxgloveEndpoint:
         return self._board.advertise(info)
 
     def _open_channel(self, info: TopicInfo, described: Described) -> Channel:
-        return self._server.channel(info.name, str(info.encoding), described)
+        return self._server.channel(info.name, str(info.encoding), described, self.shared.ended)
 
     def _subscribed(self, viewer: Viewer, subscription: int, channel: int) -> None:
         if self._board is not None:
-            self._board.missed(channel, lambda stamp_ns, body: viewer.show(subscription, stamp_ns, body))
+            self._board.missed(channel, lambda stamp_ns, body: viewer.show(subscription, stamp_ns, body, must=True))
+
+    def _show_all(self, channel: int, body: bytes, must: bool) -> None:
+        self.shared.show(channel, body, must=must)
 
     # --- topics of viewers ------------------------------------------------------------------------------------------
 

@@ -5,6 +5,7 @@
 """
 
 import json
+import struct
 from collections.abc import Iterator
 from enum import StrEnum
 from typing import Any, Final, NamedTuple
@@ -18,6 +19,7 @@ CALL: Final = 2
 PLAYBACK: Final = 3
 """The first byte of what a viewer sends in binary frames."""
 TEXT, BINARY = 1, 2
+_MESSAGE: Final = struct.Struct("<BIQ")
 _CONTINUATION, _CLOSE, _PING, _PONG = 0, 8, 9, 10
 _DATA_OPCODES: Final = frozenset({_CONTINUATION, TEXT, BINARY})
 _OPCODES: Final = _DATA_OPCODES | {_CLOSE, _PING, _PONG}
@@ -181,59 +183,61 @@ def _spoken(text: bytes) -> Spoken:
     return Spoken(said)
 
 
-class Frame(NamedTuple):
-    """A whole frame of the server, as it is on the wire. `subscription`: of a topic's message; None: it is another
-    kind, which must arrive."""
-
-    wire: bytes
-    subscription: int | None
-
-
 class Said:
     """What the server sends, cut into frames; their payloads are not masked."""
 
     def __init__(self) -> None:
-        self._buffer = bytearray()
+        self._left = bytearray()  # the beginning of a frame
 
-    def feed(self, data: bytes) -> list[Frame]:
-        """The frames that are whole now."""
-        buffer = self._buffer
-        buffer += data
-        found: list[Frame] = []
-        at = 0
-        while (size := _size_at(buffer, at)) is not None and len(buffer) - at >= size[0] + size[1]:
-            header, payload = size
-            begins = at + header
-            subscription = None
-            if buffer[at] & 0x0F == BINARY and payload >= 5 and buffer[begins] == MESSAGE_DATA:
-                subscription = int.from_bytes(buffer[begins + 1 : begins + 5], "little")
-            found.append(Frame(bytes(memoryview(buffer)[at : begins + payload]), subscription))
-            at = begins + payload
-        if at:
-            del buffer[:at]
+    def feed(self, data: bytes) -> list[bytes]:
+        """The frames that are whole now, as they are on the wire."""
+        if self._left:
+            self._left += data
+            data = bytes(self._left) if _ends(self._left) else b""
+            if not data:
+                return []
+            self._left.clear()
+        found: list[bytes] = []
+        at, end = 0, len(data)
+        while at < end and (size := _size_at(data, at)) is not None and size[0] + size[1] <= end - at:
+            stop = at + size[0] + size[1]
+            found.append(data[at:stop])
+            at = stop
+        self._left += data[at:]
         return found
 
 
-def _size_at(buffer: bytearray, at: int) -> tuple[int, int] | None:
+def _ends(buffer: bytearray) -> bool:
+    """Whether the first frame in it is whole."""
+    size = _size_at(buffer, 0)
+    return size is not None and len(buffer) >= size[0] + size[1]
+
+
+def _size_at(data: bytes | bytearray, at: int) -> tuple[int, int] | None:
     """Bytes of header and payload of the frame that begins there; None: not all of the header has come."""
-    left = len(buffer) - at
+    left = len(data) - at
     if left < 2:
         return None
-    size = buffer[at + 1] & 0x7F
-    extra = {126: 2, 127: 8}.get(size, 0)
+    size = data[at + 1] & 0x7F
+    if size < 126:
+        return 2, size
+    extra = 2 if size == 126 else 8
     if left < 2 + extra:
         return None
-    return 2 + extra, int.from_bytes(buffer[at + 2 : at + 2 + extra], "big") if extra else size
+    return 2 + extra, int.from_bytes(data[at + 2 : at + 2 + extra], "big")
 
 
 def frame(opcode: int, payload: bytes) -> bytes:
-    """A frame of the server."""
-    size = len(payload)
+    """A frame to a viewer."""
+    return _head(opcode, len(payload)) + payload
+
+
+def _head(opcode: int, size: int) -> bytes:
     if size < 126:
-        return bytes((0x80 | opcode, size)) + payload
+        return bytes((0x80 | opcode, size))
     if size < 1 << 16:
-        return bytes((0x80 | opcode, 126)) + size.to_bytes(2, "big") + payload
-    return bytes((0x80 | opcode, 127)) + size.to_bytes(8, "big") + payload
+        return bytes((0x80 | opcode, 126)) + size.to_bytes(2, "big")
+    return bytes((0x80 | opcode, 127)) + size.to_bytes(8, "big")
 
 
 def close_frame(code: int, why: str) -> bytes:
@@ -246,7 +250,6 @@ def text_frame(said: dict[str, Any]) -> bytes:
     return frame(TEXT, json.dumps(said, separators=(",", ":")).encode())
 
 
-def message_frame(subscription: int, stamp_ns: int, body: bytes) -> bytes:
-    """A topic's message."""
-    head = bytes((MESSAGE_DATA,)) + subscription.to_bytes(4, "little") + stamp_ns.to_bytes(8, "little")
-    return frame(BINARY, head + body)
+def message_head(subscription: int, stamp_ns: int, body_bytes: int) -> bytes:
+    """The beginning of the frame with a topic's message, before its body."""
+    return _head(BINARY, _MESSAGE.size + body_bytes) + _MESSAGE.pack(MESSAGE_DATA, subscription, stamp_ns)

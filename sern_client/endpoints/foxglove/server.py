@@ -1,10 +1,12 @@
-"""The SDK's server: what it tells in threads of its own is told on the event loop here."""
+"""The SDK's server: what it tells in threads of its own is told on the event loop here.
+
+It speaks of topics, services and what viewers publish. What is shown of topics goes past it, to the viewers themselves.
+"""
 
 import asyncio
 import logging
 import secrets
-import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from sern_client.endpoints.common.handover import Handover
@@ -17,7 +19,7 @@ if TYPE_CHECKING:
     from foxglove import websocket
 
 BACKLOG: Final = 16_384
-"""Messages that the SDK keeps for one viewer. The door takes them at once, so that nothing gathers there. With fewer
+"""What the SDK keeps for one viewer, by number. The door takes it at once, so that nothing gathers there. With fewer
 the SDK cuts a viewer to whom some thousand topics are announced at once."""
 HANDED_OVER_BYTES: Final = 16 * 2**20
 """What viewers publish and waits for the event loop."""
@@ -96,13 +98,16 @@ class Server:
         if self._handover is not None:
             self._handover.close()
 
-    def channel(self, topic: str, message_encoding: str, described: Described) -> "Channel":
-        """A new channel. The constructor that the SDK has for it keeps each one for ever."""
+    def channel(
+        self, topic: str, message_encoding: str, described: Described, ended: Callable[[int], None]
+    ) -> "Channel":
+        """A new channel; its number is told to `ended` when it is closed. The constructor that the SDK has for it keeps
+        each one for ever."""
         import foxglove
 
         assert self._context is not None
         schema = foxglove.Schema(name=described.name, encoding=described.schema_encoding, data=described.text)
-        return Channel(self._context._create_channel(topic, message_encoding=message_encoding, schema=schema))
+        return Channel(self._context._create_channel(topic, message_encoding=message_encoding, schema=schema), ended)
 
     def add_service(self, service: "foxglove.Service") -> None:
         """ConfigError when it is not taken."""
@@ -118,19 +123,16 @@ class Server:
 
 
 class Channel:
-    """A topic as viewers see it."""
+    """A topic as viewers are told of it."""
 
-    def __init__(self, base: "foxglove._foxglove_py.BaseChannel") -> None:
+    def __init__(self, base: "foxglove._foxglove_py.BaseChannel", ended: Callable[[int], None]) -> None:
         self.number: int = base.id()
-        self._log = base.log
         self._close = base.close
-
-    def log(self, body: bytes) -> None:
-        """Show a message to all who look. Its time is when it came: the clocks of its origins may differ."""
-        self._log(body, time.time_ns())
+        self._ended = ended
 
     def close(self) -> None:
         self._close()
+        self._ended(self.number)
 
 
 class _Listening:

@@ -1,8 +1,8 @@
 """One viewer: what it sends passes on to the server when it is sound, and what it gets waits here, within bounds.
 
-The server keeps what it has for a viewer by number of messages, the oldest of which it drops without telling anybody.
-So all that it has is taken from it at once, and what a slow viewer does not take waits here: bounded in bytes and time,
-and dropped with a reason. What is no message of a topic is never dropped; a viewer that leaves too much of that is cut.
+Messages of topics do not pass through the server, which would keep them by number, drop the oldest and tell nobody.
+They wait here, bounded in bytes and time, and are dropped with a reason. What the server says (topics, services,
+answers) is never dropped; a viewer that leaves too much of that is cut.
 """
 
 import asyncio
@@ -13,14 +13,15 @@ from typing import Any, Final, NamedTuple, Protocol, TypeGuard, cast
 
 from sern_client.endpoints.common.queue import BoundedQueue
 from sern_client.endpoints.foxglove import frames, handshake
-from sern_client.endpoints.foxglove.frames import Fault, Frame, FrameError, Heard, Said
+from sern_client.endpoints.foxglove.frames import Fault, FrameError, Heard, Said
 from sern_core.vocabulary.types import DropReason
 from sern_runtime import clock
 
 WAIT_S: Final = 1.0
 """A topic's message that a viewer has not begun to take after so long is of no use to who looks at what is now."""
-MUST_BYTES: Final = 32 * 2**20
-"""What must not be dropped and waits for a viewer: beyond, it is cut."""
+MUST_BYTES: Final = 128 * 2**20
+"""What must not be dropped and waits for a viewer: beyond, it is cut. Who comes may ask for several large maps at once;
+what waits of them are the very bodies that are kept for all."""
 SOCKET_BYTES: Final = 2**18
 """What waits in this process and in the system behind a message that has its turn: more would only make it late."""
 MAX_SUBSCRIPTIONS: Final = 20_000
@@ -29,8 +30,9 @@ FLUSH_S: Final = 1.0
 
 
 class _Waiting(NamedTuple):
-    wire: bytes
-    subscription: int
+    head: bytes
+    body: bytes
+    channel: int
     until_s: float
 
 
@@ -39,14 +41,13 @@ class Owner(Protocol):
 
     dropped: Counter[DropReason]
 
-    def keeps(self, channel: int) -> bool:
-        """Whether each message of a channel must arrive: its last one holds until there is another."""
-
     def subscribed(self, viewer: "Viewer", subscription: int, channel: int) -> None:
         """A viewer has asked for a channel."""
 
-    def fault(self, fault: Fault, problem: str) -> None:
-        """Count something that a viewer sent, and say it."""
+    def unsubscribed(self, viewer: "Viewer", channel: int) -> None: ...
+
+    def fault(self, fault: Fault, problem: str, peer: str = "") -> None:
+        """Count something that a viewer sent, and say it, once of each host."""
 
     def behind(self, viewer: "Viewer") -> None:
         """It takes less than what comes; told once until it has caught up."""
@@ -79,7 +80,7 @@ class Viewer:
         self._paused = False
         self._behind = False
         self._waiting: BoundedQueue[_Waiting] = BoundedQueue(max_bytes=max_waiting_bytes)
-        self._must: deque[bytes] = deque()
+        self._must: deque[tuple[bytes, ...]] = deque()
         self._must_bytes = 0
         transport.set_write_buffer_limits(high=SOCKET_BYTES)
         _set(transport, socket.SOL_SOCKET, socket.SO_SNDBUF, SOCKET_BYTES)
@@ -97,13 +98,13 @@ class Viewer:
         try:
             spoken = self._heard.feed(data)
         except FrameError as error:
-            self._owner.fault(error.fault, f"{self.peer} is cut: {error}")
+            self._owner.fault(error.fault, f"is cut: {error}", self.peer)
             self.cut(error.code, str(error))
             return
         self._server.write(data)
         for each in spoken:
             if each.problem:  # the server tells it so
-                self._owner.fault(Fault.CONTENT, f"{self.peer} sent {each.problem}")
+                self._owner.fault(Fault.CONTENT, f"sent {each.problem}", self.peer)
             elif each.said["op"] == "subscribe":
                 self._subscribes(each.said.get("subscriptions"))
             elif each.said["op"] == "unsubscribe":
@@ -122,7 +123,16 @@ class Viewer:
     def _unsubscribes(self, listed: Any) -> None:
         for number in listed if isinstance(listed, list) else ():
             if _is_id(number):
-                self._channels.discard(self.subscriptions.pop(number, -1))
+                channel = self.subscriptions.pop(number, None)
+                if channel is not None:
+                    self._channels.discard(channel)
+                    self._owner.unsubscribed(self, channel)
+
+    def forget(self, subscription: int, channel: int) -> None:
+        """A channel is no more."""
+        self._channels.discard(channel)
+        self.dropped.pop(channel, None)
+        self.subscriptions.pop(subscription, None)
 
     # --- to the viewer ----------------------------------------------------------------------------------------------
 
@@ -151,30 +161,41 @@ class Viewer:
     def tell(self, said: dict[str, Any]) -> None:
         """Say something of our own to this viewer alone."""
         if self.ready and not self.closed:
-            self._send(Frame(frames.text_frame(said), None))
+            self._send(frames.text_frame(said))
 
-    def show(self, subscription: int, stamp_ns: int, body: bytes) -> None:
-        """A message for this viewer alone, which must arrive."""
-        if self.ready and not self.closed:
-            self._send(Frame(frames.message_frame(subscription, stamp_ns, body), None))
+    def show(self, subscription: int, stamp_ns: int, body: bytes, *, must: bool) -> None:
+        """A topic's message. `must`: it holds until there is another, so that it must arrive."""
+        if not self.ready or self.closed:
+            return
+        head = frames.message_head(subscription, stamp_ns, len(body))
+        if self._free:
+            self._transport.writelines([head, body])
+        elif must:
+            self._send(head, body)
+        else:
+            if not self._behind and len(self._waiting):
+                self._behind = True
+                self._owner.behind(self)
+            channel = self.subscriptions.get(subscription, -1)
+            waiting = _Waiting(head, body, channel, clock.now() + WAIT_S)
+            for dropped in self._waiting.put(waiting, len(head) + len(body)):
+                self._drop(DropReason.QUEUE_FULL, dropped)
 
-    def _send(self, each: Frame) -> None:
-        if not self._paused and not self._must and not len(self._waiting):
-            self._transport.write(each.wire)
+    @property
+    def _free(self) -> bool:
+        """Whether nothing waits."""
+        return not self._paused and not self._must and not len(self._waiting)
+
+    def _send(self, *parts: bytes) -> None:
+        """What must arrive."""
+        if self._free:
+            self._transport.writelines(parts)
             return
-        if each.subscription is None or self._owner.keeps(self.subscriptions.get(each.subscription, -1)):
-            self._must.append(each.wire)
-            self._must_bytes += len(each.wire)
-            if self._must_bytes > MUST_BYTES:
-                self._owner.fault(Fault.SLOW, f"{self.peer} is cut: it takes nothing of what must arrive")
-                self.cut(frames.AGAIN_LATER, "too slow")
-            return
-        if not self._behind and len(self._waiting):
-            self._behind = True
-            self._owner.behind(self)
-        waiting = _Waiting(each.wire, each.subscription, clock.now() + WAIT_S)
-        for dropped in self._waiting.put(waiting, len(each.wire)):
-            self._drop(DropReason.QUEUE_FULL, dropped)
+        self._must.append(parts)
+        self._must_bytes += sum(map(len, parts))
+        if self._must_bytes > MUST_BYTES:
+            self._owner.fault(Fault.SLOW, "is cut: it takes nothing of what must arrive", self.peer)
+            self.cut(frames.AGAIN_LATER, "too slow")
 
     def pause(self) -> None:
         """Its connection takes nothing more now."""
@@ -185,21 +206,21 @@ class Viewer:
         self._paused = False
         now = clock.now()
         while self._must and not self._paused:
-            wire = self._must.popleft()
-            self._must_bytes -= len(wire)
-            self._transport.write(wire)
+            parts = self._must.popleft()
+            self._must_bytes -= sum(map(len, parts))
+            self._transport.writelines(parts)
         while len(self._waiting) and not self._paused:
             waiting = self._waiting.pop()
             if waiting.until_s < now:
                 self._drop(DropReason.LIFESPAN, waiting)
             else:
-                self._transport.write(waiting.wire)
+                self._transport.writelines([waiting.head, waiting.body])
         if not self._paused:
             self._behind = False
 
     def _drop(self, why: DropReason, waiting: _Waiting) -> None:
         self._owner.dropped[why] += 1
-        self.dropped[self.subscriptions.get(waiting.subscription, -1)] += 1
+        self.dropped[waiting.channel] += 1
 
     # --- its end ----------------------------------------------------------------------------------------------------
 
@@ -217,6 +238,8 @@ class Viewer:
             self._drop(DropReason.DISCONNECTED, self._waiting.pop())
         self._must.clear()
         self._must_bytes = 0
+        for channel in self._channels:
+            self._owner.unsubscribed(self, channel)
         if self._server is not None:
             self._server.abort()
         if self._paused:
@@ -235,18 +258,16 @@ class Viewer:
 class ServerSide(asyncio.Protocol):
     """The connection from a viewer to the server behind the door."""
 
-    def __init__(self, viewer: Viewer) -> None:
+    def __init__(self, viewer: Viewer, connection: socket.socket) -> None:
         self._viewer = viewer
-        self._transport: asyncio.Transport | None = None
+        self._connection = connection
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._transport = cast("asyncio.Transport", transport)
-        self._viewer.joined(self._transport)
+        self._viewer.joined(cast("asyncio.Transport", transport))
 
     def data_received(self, data: bytes) -> None:
         # The server sends with Nagle's algorithm: what it has next waits until we have confirmed what came.
-        assert self._transport is not None
-        _set(self._transport, socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
+        self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
         self._viewer.say(data)
 
     def pause_writing(self) -> None:
