@@ -36,7 +36,7 @@ PYTHON_HAS := import sys; print("%d.%d" % sys.version_info[:2]); sys.exit(sys.ve
 $(VENV)/.ready: pyproject.toml constraints.txt
 	@has=$$($(PYTHON) -c '$(PYTHON_HAS)') || { echo "$(PYTHON) is Python $$has, $(PYTHON_NEEDED)" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,bench,report,lossy,dds,zenoh,twin,geo,sim,viz,seg]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,bench,report,lossy,dds,zenoh,twin,geo,sim,viz,seg,foxglove]'
 	@touch $@
 
 setup: $(VENV)/.ready
@@ -68,7 +68,7 @@ COMPILED := $(VENV)-compiled
 CORE_TESTS := tests/sern_core tests/sern_sim tests/fuzz tests/test_vectors.py tests/test_compiled.py
 compiled: wheel
 	$(PYTHON) -m venv $(COMPILED)
-	$(COMPILED)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt "$$(ls dist/sern-*.whl)[dev,bench,report,lossy,dds,zenoh,twin,geo,sim,viz,seg]"
+	$(COMPILED)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt "$$(ls dist/sern-*.whl)[dev,bench,report,lossy,dds,zenoh,twin,geo,sim,viz,seg,foxglove]"
 	$(COMPILED)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --force-reinstall dist/sern-*.whl
 	mkdir -p build/checkout
 	ln -sfn ../../tests build/checkout/tests

@@ -15,6 +15,7 @@ from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding
 from sern_runtime.config import endpoints as sections
 from sern_runtime.config.client import ClientFile
+from sern_runtime.config.foxglove import FoxgloveEndpoint
 from sern_runtime.config.load import Loaded
 from sern_runtime.config.twin import TwinEndpoint
 from sern_runtime.ros_files import installed_files
@@ -110,7 +111,7 @@ def local_encoding(model: ClientFile) -> Encoding:
     cdr = not isinstance(first, sections.Ros1Endpoint)
     if isinstance(first, sections.RecordEndpoint):
         cdr = first.path.endswith(".mcap")
-    elif isinstance(first, sections.SyntheticEndpoint | TwinEndpoint):
+    elif isinstance(first, sections.SyntheticEndpoint | TwinEndpoint | FoxgloveEndpoint):
         cdr = first.encoding == "cdr"
     return Encoding.CDR if cdr else Encoding.ROS1
 

@@ -63,9 +63,15 @@ class OnDemand:
     # What there is
 
     def changed(self, item: XrObject) -> None:
-        """There is an object, or it is described otherwise."""
+        """There is an object, or it is described otherwise. One without encoding is no topic: a transform names the topic
+        that it came by."""
         name = TopicName(item.attributes.get("topic", ""))
-        if not name or parse_service(name) is not None or not self._patterns.fullmatch(name):
+        if (
+            not name
+            or "encoding" not in item.attributes
+            or parse_service(name) is not None
+            or not self._patterns.fullmatch(name)
+        ):
             return
         info = self._described(name, item)
         before = self._offered.get(item.id)
@@ -92,7 +98,7 @@ class OnDemand:
             info = TopicInfo(
                 local,
                 item.type_name,
-                Encoding(attributes.get("encoding", "")),
+                Encoding(attributes["encoding"]),
                 item.definition_hash,
                 item.definition,
                 latched=attributes.get("durability") == Durability.TRANSIENT_LOCAL.value,

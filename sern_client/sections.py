@@ -9,6 +9,7 @@ from sern_client.endpoints.base import Endpoint
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_runtime.config import endpoints as sections
 from sern_runtime.config.base import EndpointBase
+from sern_runtime.config.foxglove import FoxgloveEndpoint, installing_foxglove
 from sern_runtime.config.twin import TwinEndpoint
 
 if TYPE_CHECKING:
@@ -47,6 +48,8 @@ def make_section(
             return _dds(section, resolve, as_node=as_node)
         case TwinEndpoint():
             return _twin(section, resolve)
+        case FoxgloveEndpoint():
+            return _foxglove(section, resolve)
         case sections.SyntheticEndpoint():
             from sern_client.endpoints.synthetic import SyntheticEndpoint, SyntheticOptions
 
@@ -103,6 +106,15 @@ def _twin(section: TwinEndpoint, resolve: Resolve) -> Endpoint:
         view = ViewOptions(*section.view.place)
     options = options_of(TwinOptions, section.model_copy(update={"robots": robots, "view": view}), resolve)
     return TwinEndpoint(options)
+
+
+def _foxglove(section: FoxgloveEndpoint, resolve: Resolve) -> Endpoint:
+    if not sections.installed("foxglove"):
+        raise ConfigError(f"endpoint kind foxglove needs foxglove-sdk: {installing_foxglove()}")
+    from sern_client.endpoints.foxglove.endpoint import FoxgloveEndpoint
+    from sern_client.endpoints.foxglove.options import FoxgloveOptions
+
+    return FoxgloveEndpoint(options_of(FoxgloveOptions, section, resolve))
 
 
 def _dds(section: sections.DdsEndpoint, resolve: Resolve, *, as_node: bool) -> Endpoint:

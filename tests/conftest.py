@@ -23,7 +23,7 @@ from sern_runtime.config.keys import SecretKey, generate
 from sern_runtime.loop import raise_open_files
 from sern_tools.ports import release_claims
 from tests.exploring import load_profile
-from tests.support import DEADLINE_S, Patience
+from tests.support import DEADLINE_S, LASTING, Patience, open_sockets
 
 Context = zmq.Context[zmq.Socket[bytes]]
 PEERS: Final = Path(__file__).parent / "peers"
@@ -167,19 +167,6 @@ def _children() -> set[str]:
     return found
 
 
-def _sockets() -> set[str]:
-    """The sockets and event descriptors that this process has open, as /proc names them."""
-    found = set()
-    for entry in Path("/proc/self/fd").iterdir():
-        try:
-            target = str(entry.readlink())
-        except OSError:
-            continue
-        if target.startswith("socket:"):
-            found.add(f"fd {entry.name} -> {target}")
-    return found
-
-
 def _threads() -> set[str]:
     return {thread.name for thread in threading.enumerate() if not thread.daemon}
 
@@ -187,14 +174,14 @@ def _threads() -> set[str]:
 @pytest.fixture(scope="session", autouse=True)
 def nothing_left_behind() -> Iterator[None]:
     """At the end of the session: no threads, child processes or sockets more than at its start."""
-    probes = (_threads, _children, _sockets)
+    probes = (_threads, _children, open_sockets)
     before = [probe() for probe in probes]
     yield
     release_claims()
     patience = Patience()
     while True:
         gc.collect()
-        left = [item for probe, old in zip(probes, before, strict=True) for item in probe() - old]
+        left = [item for probe, old in zip(probes, before, strict=True) for item in probe() - old - LASTING]
         if not left:
             return
         if patience.over():

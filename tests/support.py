@@ -14,9 +14,24 @@ from sern_core.vocabulary.types import TopicName
 
 DEADLINE_S: Final = 240.0
 """Long enough for a machine that is busy with much else; reached only when something is broken."""
+LASTING: Final[set[str]] = set()
+"""What a library keeps open until its process ends, by design: no test is to blame for it."""
 _POLL_S: Final = 0.002
 _STEP_S: Final = 0.5
 """The most that the time between two polls counts for."""
+
+
+def open_sockets() -> set[str]:
+    """The sockets and event descriptors that this process has open, as /proc names them."""
+    found = set()
+    for entry in Path("/proc/self/fd").iterdir():
+        try:
+            target = str(entry.readlink())
+        except OSError:
+            continue
+        if target.startswith("socket:"):
+            found.add(f"fd {entry.name} -> {target}")
+    return found
 
 
 class Patience:

@@ -13,6 +13,8 @@ PACKAGES = (
 PUBLIC: Final = frozenset({"_asdict", "_fields", "_make", "_replace"})
 """The documented methods of named tuples, whose names only keep out of the way of the fields."""
 FOREIGN: Final = {
+    # The constructor that the SDK has for a channel keeps each one for ever; this is what it calls.
+    "sern_client/endpoints/foxglove/server.py": {"_create_channel"},
     "sern_runtime/loop.py": {"_current_frames", "_exit"},  # documented: where a thread is, and an end without clean-up
     # What cyclonedds has no public name for: its C layer, and the handles that it takes.
     "sern_client/endpoints/dds/raw.py": {

@@ -34,6 +34,7 @@ from sern_runtime.config.base import (
     unit_makes,
     unit_problems,
 )
+from sern_runtime.config.foxglove import FoxgloveEndpoint
 from sern_runtime.config.twin import TwinEndpoint
 from sern_runtime.config.yaml import Loc
 
@@ -382,6 +383,7 @@ EndpointSection = Annotated[
     | DdsEndpoint
     | ZenohEndpoint
     | RclpyEndpoint
-    | TwinEndpoint,
+    | TwinEndpoint
+    | FoxgloveEndpoint,
     Field(discriminator="kind"),
 ]

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-ENDPOINTS = ("bag", "dds", "rclpy", "record", "ros1", "synthetic", "zenoh")
+ENDPOINTS = ("bag", "dds", "foxglove", "rclpy", "record", "ros1", "synthetic", "zenoh")
 SHOWN = "import sys, {program}; print(*sys.modules)"
 
 
@@ -24,7 +24,10 @@ def test_what_no_file_asked_for_is_not_imported(program: str) -> None:
     assert program in there
     for kind in ENDPOINTS:
         assert not {f"sern_client.endpoints.{kind}", f"sern_client.endpoints.{kind}.endpoint"} & there
-    assert not {"aiohttp", "zenoh", "cyclonedds", "rclpy", "matplotlib", "rosbags.rosbag1", "rosbags.rosbag2"} & there
+    assert (
+        not {"aiohttp", "foxglove", "zenoh", "cyclonedds", "rclpy", "matplotlib", "rosbags.rosbag1", "rosbags.rosbag2"}
+        & there
+    )
     assert "sern_runtime.config.meanings" not in there, "the source is read for schemas, not for a daemon"
 
 

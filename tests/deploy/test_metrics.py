@@ -14,6 +14,8 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 from ruamel.yaml import YAML
 
+from sern_client.endpoints.foxglove.endpoint import FoxgloveEndpoint
+from sern_client.endpoints.foxglove.options import FoxgloveOptions
 from sern_client.navigation.metrics import register_navigation
 from sern_client.navigation.node import NavigationNode
 from sern_client.navigation.options import NodeOptions
@@ -56,6 +58,13 @@ def navigation() -> str:
     return generate_latest(registry).decode()
 
 
+def viewers() -> str:
+    """What an endpoint at which people look says of itself."""
+    registry = CollectorRegistry()
+    FoxgloveEndpoint(FoxgloveOptions()).register_metrics(Metrics(registry))
+    return generate_latest(registry).decode()
+
+
 @pytest.fixture(scope="module")
 def metrics(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
     """Sample name -> labels, of a relay with a robot and a site, of twins, and of a node that navigates. A family
@@ -81,7 +90,7 @@ def metrics(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
             return [process.get("/metrics")[1] for process in (relay, site, robot, twin)]
 
     found: dict[str, set[str]] = {}
-    for text in (*asyncio.run(collect()), navigation()):
+    for text in (*asyncio.run(collect()), navigation(), viewers()):
         for family in text_string_to_metric_families(text):
             name = family.name + ("_total" if family.type == "counter" else "")
             found.setdefault(name, {"?"})

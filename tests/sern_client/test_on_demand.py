@@ -77,6 +77,16 @@ async def case() -> AsyncIterator[Case]:
     made.made.close()
 
 
+async def test_a_transform_is_no_topic(case: Case, caplog: pytest.LogCaptureFixture) -> None:
+    """A relay tells of each as an object that names the topic it came by."""
+    topic = replace(thing("/robot/tf"), kind=ObjectKind.TRANSFORM)
+    attributes = {"parent": "odom", "child": "base_link", "static": "false", "topic": "/robot/tf"}
+    case.made.changed(replace(topic, id="tf:odom>base_link@robot", attributes=attributes))
+    assert not case.viewers[0].offered and not caplog.records
+    case.made.changed(topic)
+    assert case.viewers[0].offered.keys() == {"/robot/tf"}, "but the topic is"
+
+
 async def test_all_viewers_are_offered_what_matches_by_its_name_here(case: Case) -> None:
     for topic in ("/robot/odom", "/van/map", "/other/odom", "/robot/set/_service", "/van/secret"):
         case.there(topic)

@@ -12,6 +12,7 @@ pytest.importorskip("cyclonedds", reason="the dds endpoint needs cyclonedds: pip
 
 from sern_client.endpoints.bag import BagOptions
 from sern_client.endpoints.dds.endpoint import DdsOptions
+from sern_client.endpoints.foxglove.options import FoxgloveOptions
 from sern_client.endpoints.jackal import JACKAL
 from sern_client.endpoints.rclpy import RclpyOptions
 from sern_client.endpoints.record import RecordOptions
@@ -33,6 +34,7 @@ from sern_runtime.config.endpoints import (
     SyntheticEndpoint,
     ZenohEndpoint,
 )
+from sern_runtime.config.foxglove import FoxgloveEndpoint
 from sern_runtime.config.twin import TwinEndpoint, TwinRobot, TwinView
 
 PAIRS = [
@@ -44,6 +46,7 @@ PAIRS = [
     (ZenohEndpoint, ZenohOptions),
     (RclpyEndpoint, RclpyOptions),
     (TwinEndpoint, TwinOptions),
+    (FoxgloveEndpoint, FoxgloveOptions),
 ]
 SAID_BY_NO_FILE = {"second", "publishes_only", "enclave", "as_node"}
 OTHERWISE_BY_DEFAULT = {(DdsOptions, "domain")}
@@ -121,3 +124,9 @@ def test_robots_of_a_twin() -> None:
     assert [twin.options for twin in endpoint.robots.values()] == [
         RobotOptions("jackal1", "/jackal1/odom", "/jackal1/plan", max_speed_mps=1.5)
     ]
+
+
+def test_viewers_need_a_package_that_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sections, "installed", lambda package: False)
+    with pytest.raises(ConfigError, match=r"foxglove needs foxglove-sdk: .* -m pip install foxglove-sdk"):
+        make_section(FoxgloveEndpoint(kind="foxglove"), Path)

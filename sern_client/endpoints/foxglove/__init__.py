@@ -1,0 +1,1 @@
+"""Viewers: Foxglove and Lichtblick."""
