@@ -19,13 +19,21 @@ from sern_client.bridge import Bridge
 from sern_client.checks import TableCheck
 from sern_client.client_metrics import Counting, register_client
 from sern_client.connection import Connection
-from sern_client.endpoints.base import BothTold, Endpoint, ObjectEndpoint, ServedEndpoint, ShowingEndpoint
+from sern_client.endpoints.base import (
+    BothTold,
+    Endpoint,
+    ObjectEndpoint,
+    ServedEndpoint,
+    ShowingEndpoint,
+    viewers_of,
+)
 from sern_client.endpoints.composite import with_services
 from sern_client.factory import local_encoding, make_endpoint, make_link_topics
 from sern_client.guard import Guard
 from sern_client.link_news import SILENT, LinkNews
 from sern_client.link_state import LinkState
 from sern_client.objects_view import objects_view
+from sern_client.on_demand import OnDemand
 from sern_client.scene.making import make_scene
 from sern_client.services import ServiceBridge
 from sern_client.site import Site
@@ -34,7 +42,7 @@ from sern_client.tables import Tables
 from sern_core.bodies.lossy import missing
 from sern_core.objects.feed import PERIOD_S
 from sern_core.site.client import ClientCore, ClientEvents
-from sern_core.topics.patterns import compile_pattern
+from sern_core.topics.patterns import PatternSet, compile_pattern
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.trace import DecisionTrace
 from sern_core.vocabulary.types import CLASS_LABELS, DropReason, ObjectKind
@@ -130,8 +138,7 @@ class ClientDaemon:
         if isinstance(endpoint, ObjectEndpoint):
             endpoint.use_objects(objects)
         self.scene = make_scene(loaded, endpoint, self.site, objects, local_encoding(model))
-        self.core.subscribe(model.subscribe_patterns(), now=now)
-        self.core.subscribe_objects(model.object_selections(), now=now)
+        self.on_demand = self._make_on_demand(endpoint, objects)
         self.adaptation = self._make_adaptation()
         self.news = LinkNews(self.core.link, model.relay.endpoint)
         self.link_state = LinkState(
@@ -149,6 +156,8 @@ class ClientDaemon:
                 endpoint.show_scene(self.scene)
         self.check = TableCheck(Tables(self.bridge, self.link_state, self.scene), now=now)
         self.connection = Connection(self.core, model.relay, model.link, on_down=self.link_down)
+        self.bridge.inbound.subscribed.begin(model.subscribe_patterns())
+        self.core.subscribe_objects(model.object_selections(), now=now)
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
         self._http: HttpServer | None = None
         self.tasks: list[asyncio.Task[None]] = []
@@ -176,6 +185,17 @@ class ClientDaemon:
             return None
         rules = tuple((compile_pattern(section.match), section.timeout_s) for section in sections)
         return GoalWatch(rules, self.site.advertise)
+
+    def _make_on_demand(self, endpoint: Endpoint, objects: CoreObjects) -> OnDemand | None:
+        """What offers topics to an endpoint at which people look; None: this client has none such."""
+        patterns, viewers = self.loaded.model.on_demand, viewers_of(endpoint)
+        if not viewers:
+            return None
+        add = partial(self.bridge.inbound.subscribed.add, "on_demand")
+        made = OnDemand(PatternSet(patterns), self.site, viewers, add=add, ledger=self.core.received)
+        if patterns:
+            objects.listen(made)
+        return made
 
     def _make_adaptation(self) -> Adaptation | None:
         section = self.loaded.model.adaptation
@@ -439,6 +459,8 @@ class ClientDaemon:
             if self.scene is not None:
                 stack.callback(self.scene.close)
             stack.callback(self.bridge.close)
+            if self.on_demand is not None:
+                stack.callback(self.on_demand.close)
             stack.callback(self.link_state.close)
             if self.bridge.services is not None:
                 stack.push_async_callback(self.bridge.services.stop)

@@ -5,6 +5,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, KeysView, Sequence
 from dataclasses import replace
+from functools import partial
 from math import inf
 from typing import Final
 
@@ -15,6 +16,7 @@ from sern_client.guard import Guard
 from sern_client.keeping import Keeping
 from sern_client.rebuild import Rebuilds
 from sern_client.site import Site
+from sern_client.subscribed import Subscribed
 from sern_client.update_topics import UpdateTopics
 from sern_client.withdrawal import Kept, Withdrawable, Withdrawal
 from sern_core.site.client import ClientCore
@@ -117,7 +119,9 @@ class Inbound:
         self._again = Timer(self._reconsider)
         self._again_s = AGAIN_S[0]
         self.rebuilds = Rebuilds(self._grid_shown, self._settle)
-        self._updates = UpdateTopics(lambda: core.subscription.patterns, self._subscribe)
+        self.subscribed = Subscribed(self._subscribe)
+        """What the relay is asked for."""
+        self._updates = UpdateTopics(self.subscribed.covers, partial(self.subscribed.add, "updates"))
         self.keeping = Keeping(keepers_of(site.endpoint), core.hold, self._release_kept, self._keep_in)
         self._keep_timer = Timer(self.keeping.keep_soon)
 

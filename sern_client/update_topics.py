@@ -9,7 +9,6 @@ from collections.abc import Callable
 from itertools import islice
 from typing import Final
 
-from sern_core.topics.patterns import PatternSet
 from sern_core.vocabulary.message import StreamId
 from sern_core.vocabulary.types import TopicName
 from sern_runtime import clock
@@ -25,13 +24,13 @@ _log = logging.getLogger(__name__)
 class UpdateTopics:
     """`opened` and `closed` for each stream of whole grids; `close` it at the end.
 
-    `patterns()` tells what the site subscribes to, before anything is added; `subscribe(patterns)` replaces that.
+    `of_site(topic)` tells whether the site subscribes to a topic by itself; `add(names)` asks for these, in place of
+    those before.
     """
 
-    def __init__(self, patterns: Callable[[], tuple[str, ...]], subscribe: Callable[[tuple[str, ...]], None]) -> None:
-        self._patterns = patterns
-        self._subscribe = subscribe
-        self._own: PatternSet | None = None  # what the site subscribes to by itself
+    def __init__(self, of_site: Callable[[TopicName], bool], add: Callable[[list[TopicName]], None]) -> None:
+        self.of_site = of_site
+        self._add = add
         self._open: dict[StreamId, TopicName] = {}
         self._told: list[TopicName] = []
         self._complained = False
@@ -42,12 +41,6 @@ class UpdateTopics:
         """Ask for nothing more."""
         self._timer.cancel()
         self._open.clear()
-
-    def of_site(self, topic: TopicName) -> bool:
-        """Whether the site subscribes to a topic by itself."""
-        if self._own is None:
-            self._own = PatternSet(self._patterns())
-        return self._own.fullmatch(topic)
 
     def opened(self, stream: StreamId, topic: TopicName) -> None:
         """The updates of a stream are on a topic: have it, unless the site has it by itself."""
@@ -73,7 +66,7 @@ class UpdateTopics:
                 len(topics), MAX_TOPICS,
             )  # fmt: skip
         wanted = sorted(islice(topics, MAX_TOPICS))
-        if wanted != self._told and self._own is not None:
+        if wanted != self._told:
             self._told = wanted
             self._next_s = clock.now() + PAUSE_S
-            self._subscribe((*self._own.texts, *wanted))
+            self._add(wanted)

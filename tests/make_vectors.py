@@ -419,7 +419,14 @@ def valid() -> list[Vector]:
         _control(
             "objects",
             "the objects that a client wants, and has",
-            {"t": "objects", "kinds": ["robot", ""], "match": [".*", "zones/.*"], "since": 120, "epoch": 2**63 - 1},
+            {
+                "t": "objects",
+                "kinds": ["robot", "topic"],
+                "match": [".*", "/jackal1/.*"],
+                "bare": 1,
+                "since": 120,
+                "epoch": 2**63 - 1,
+            },
         ),
         _control("objects-lost", "the relay has nothing of the client's objects", {"t": "objects_lost"}),
         _control(

@@ -6,7 +6,7 @@ as often as it can.
 """
 
 from collections.abc import Callable, Collection
-from typing import Final
+from typing import Final, NamedTuple
 
 from sern_core.link.link import Link
 from sern_core.objects.changes import (
@@ -46,11 +46,27 @@ OVERHEAD_BYTES: Final = 40
 
 Sees = Callable[[str, ObjectKind | None], bool]
 """Whether the reader wants an object, and may have it. None: the kind of one that is gone is not known."""
+WantsValue = Callable[[str, ObjectKind], bool]
+"""Whether the reader wants an object's value, too."""
+
+
+def _always(_object_id: str, _kind: ObjectKind) -> bool:
+    return True
+
+
+class _Told(NamedTuple):
+    """An object that the reader has: its version, the hash of its texts, and, where it is told without a value, the
+    version in which it was described last, else 0."""
+
+    version: int
+    texts: int
+    bare: int
 
 
 class ObjectFeed:
-    """`sees` and `kinds` say what it is about; to change them, set both and call `restart`. `text_of` gives the text of
-    an object's definition, empty where there is none. `untold` counts objects whose texts fit into no message."""
+    """`sees`, `kinds` and `wants_value` say what it is about; to change them, set them and call `restart`. `text_of`
+    gives the text of an object's definition, empty where there is none. `untold` counts objects whose texts fit into no
+    message."""
 
     def __init__(
         self,
@@ -61,19 +77,23 @@ class ObjectFeed:
         text_of: Callable[[XrObject], str],
         now: float,
         kinds: Collection[ObjectKind] | None = None,
+        wants_value: WantsValue = _always,
         first: int = 1,
     ) -> None:
         self._registry = registry
         self._link = link
         self.sees = sees
         self.kinds = kinds
+        self.wants_value = wants_value
+        self.bare = False
+        """The reader wants no value at all: what has another value alone is not even looked at."""
         self._text_of = text_of
         self.channel = link.outgoing.open(object_stream(link.end.name, link.end.boot), first=first, now=now)
         self.untold = 0
         self.idle = False
         """Nobody is to be told anything."""
         self._pending: dict[str, None] = {}
-        self._told: dict[str, tuple[int, int]] = {}  # of each object that the reader has: version, hash of its texts
+        self._told: dict[str, _Told] = {}
         self._texts: set[str] = set()  # hashes of the texts that it has
         self._version = 0  # up to which `_pending` is what has changed
         self._began = False
@@ -140,13 +160,15 @@ class ObjectFeed:
         return not (self._pending or self._open or self.channel.retained) and self._version == self._registry.version
 
     def _poll(self, now: float) -> None:
-        if self._pending or self._open or self._version == self._registry.version:
+        registry = self._registry
+        newest = registry.described_version if self.bare else registry.version
+        if self._pending or self._open or self._version >= newest:
             return
         if now >= self._looked_s + REST_S:
             self._looked_s = now
         elif now > self._looked_s + BURST_S:
             return
-        changes = self._registry.changed(self._version, kinds=self.kinds)
+        changes = registry.changed(self._version, kinds=self.kinds)
         if changes.resync:
             self.restart()
             return
@@ -155,22 +177,25 @@ class ObjectFeed:
 
     def _tell(self, object_id: str, now: float) -> None:
         upto = None if self._pending else self._version
+        known = self._told.get(object_id)
+        if known is not None and known.bare and known.bare == self._registry.described(object_id):
+            return  # it has another value, of which the reader wants none
         about = self._registry.about(object_id)
         if about is None or not self.sees(object_id, about[0]):
-            known = self._told.pop(object_id, None) is not None
-            if known or (about is None and self._unsure and self.sees(object_id, None)):
+            unsure = about is None and self._unsure and self.sees(object_id, None)
+            if self._told.pop(object_id, None) is not None or unsure:
                 self._say(encode(Delete(object_id, upto)), now)
                 self._open = bool(self._pending)
             return
-        item = self._registry.get(object_id)
-        known_version, known_texts = self._told.get(object_id, (0, 0))
-        if item is None or known_version == item.version:
+        valued = self.wants_value(object_id, about[0])
+        item = self._registry.get(object_id, valued=valued)
+        if item is None or (known is not None and known.version == item.version):
             return
         text = self._text_of(item)
         put = put_of(item, text, upto=upto)
         texts = hash((put[:6], tuple(put.attributes.items())))
         try:
-            body = encode(set_of(put) if known_version and known_texts == texts else put)
+            body = encode(set_of(put) if known is not None and known.texts == texts else put)
         except UsageError:
             self.untold += 1  # of this object alone: the others go on
             return
@@ -178,7 +203,7 @@ class ObjectFeed:
         if text and named not in self._texts:
             self._texts.add(named)
             self._say(encode(Define(named, text)), now)
-        self._told[object_id] = item.version, texts
+        self._told[object_id] = _Told(item.version, texts, 0 if valued else self._registry.described(object_id))
         self._say(body, now)
         self._open = bool(self._pending)
 

@@ -89,6 +89,8 @@ class ObjectRegistry:
         self.inline_bytes: int | None = None
         """The largest value that is decoded where it is asked for; None: any."""
         self._version = 0
+        self.described_version = 0
+        """The version of the last change of more than a value."""
         self._entries: dict[str, Entry] = {}
         self._by_kind: dict[ObjectKind, OrderedDict[str, Entry]] = {  # least recently changed first
             kind: OrderedDict() for kind in ObjectKind
@@ -163,6 +165,7 @@ class ObjectRegistry:
             entry.ros_stamp_ns = ros_stamp_ns
         entry.wall_ns = wall_ns
         self._touch(entry, now)
+        entry.described = self.described_version = entry.version
         return self._seen(entry)
 
     def put_stream(self, stream: StreamInfo, *, wall_ns: int, now: float) -> XrObject:
@@ -201,6 +204,13 @@ class ObjectRegistry:
             self._by_stream[stream.id] = entry
             return self._seen(entry)
         return seen
+
+    def redescribe(self, stream: StreamId, *, now: float) -> None:
+        """The text of a stream's definition is known now: whoever has its object is told anew."""
+        entry = self._by_stream.get(stream)
+        if entry is not None:
+            self._touch(entry, now)
+            entry.described = self.described_version = entry.version
 
     def observe(
         self,
@@ -275,9 +285,17 @@ class ObjectRegistry:
     def __len__(self) -> int:
         return len(self._entries)
 
-    def get(self, object_id: str) -> XrObject | None:
+    def get(self, object_id: str, *, valued: bool = True) -> XrObject | None:
+        """An object; not `valued`: as if it had no value, which need not be read then."""
         entry = self._entries.get(object_id)
-        return self._seen(entry) if entry is not None else None
+        if entry is None:
+            return None
+        return self._seen(entry, valued=valued)
+
+    def described(self, object_id: str) -> int:
+        """The version in which anything but its value has changed last; 0: there is no such object."""
+        entry = self._entries.get(object_id)
+        return 0 if entry is None else entry.described
 
     def select(self, *, kind: ObjectKind | None = None, owner: ClientName | None = None) -> tuple[XrObject, ...]:
         """Objects of a kind and an owner (None: any), by id."""
@@ -399,6 +417,7 @@ class ObjectRegistry:
             assert all(entry.kind is kind and entries[entry.id] is entry for entry in some.values()), "a kind"
             assert versions == sorted(set(versions)), "the order of changes"
             assert not versions or versions[-1] <= self._version, "a version from the future"
+            assert all(entry.described <= self.described_version for entry in some.values()), "a later description"
         assert {entry.id for entry in entries.values()} == set().union(*self._owned.values()), "owners"
         assert all(self._owned.values()), "an owner of nothing"
         assert {entry.stream: entry for entry in entries.values() if entry.stream} == self._by_stream, "streams"
@@ -460,6 +479,7 @@ class ObjectRegistry:
         if not owned:
             del self._owned[entry.owner], self._bytes_of[entry.owner]
         self._version += 1
+        self.described_version = self._version
         if len(self._deletions) == self._deletions.maxlen:
             self._forgotten_version = self._deletions[0][0] if self._deletions else self._version
         self._deletions.append((self._version, entry.id, entry.kind))
@@ -468,10 +488,11 @@ class ObjectRegistry:
         """Whether telling the value takes longer than it may where somebody asks."""
         return self.inline_bytes is not None and self._values.claimed_bytes(entry) > self.inline_bytes
 
-    def _seen(self, entry: Entry) -> XrObject:
-        long = self._is_long(entry)
-        if not long:
+    def _seen(self, entry: Entry, *, valued: bool = True) -> XrObject:
+        long = valued and self._is_long(entry)
+        if valued and not long:
             self._values.read(entry)
+        value_bytes = self._values.claimed_bytes(entry) if long else entry.value_bytes
         return XrObject(
             id=entry.id,
             owner=entry.owner,
@@ -480,12 +501,12 @@ class ObjectRegistry:
             definition=entry.definition,
             definition_hash=entry.definition_hash,
             attributes=entry.attributes,
-            value=None if long else entry.body,
-            value_bytes=self._values.claimed_bytes(entry) if long else entry.value_bytes,
-            value_sha256=entry.sha256,
-            seq=entry.seq,
-            ros_stamp_ns=entry.ros_stamp_ns,
-            wall_ns=entry.wall_ns,
+            value=entry.body if valued and not long else None,
+            value_bytes=value_bytes if valued else -1,
+            value_sha256=entry.sha256 if valued else None,
+            seq=entry.seq if valued else 0,
+            ros_stamp_ns=entry.ros_stamp_ns if valued else None,
+            wall_ns=entry.wall_ns if valued else 0,
             created_s=entry.created_s,
             updated_s=entry.updated_s,
             version=entry.version,

@@ -44,6 +44,7 @@ class Entry:
         "created_s",
         "definition",
         "definition_hash",
+        "described",
         "fixed_bytes",
         "id",
         "kind",
@@ -80,6 +81,7 @@ class Entry:
         self.created_s = now
         self.updated_s = now
         self.version = 0
+        self.described = 0  # the version of the last change of more than its value
         self.stream: StreamId | None = None
 
 

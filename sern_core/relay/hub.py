@@ -47,6 +47,8 @@ from sern_core.wire import framing
 from sern_core.wire.announce import Announcement
 from sern_core.wire.numbering import Numbering
 
+STREAMS_PER_US: Final = 10
+"""Streams that are looked at in a microsecond."""
 LANE_US: Final = 300
 CONFIRMED_PER_US: Final = 8
 """What a client is charged with, in microseconds: to open a datagram lane for it, and how many subscribers are asked
@@ -374,7 +376,10 @@ class Hub:
         """Nothing depends on it here: what a client subscribed to it gets."""
 
     def on_definition(self, link: Link, digest: str, *, now: float) -> None:
-        link.reassembly.work_us += len(self.links)
+        link.reassembly.work_us += len(self.links) + len(self.relayed) // STREAMS_PER_US
+        for identity, relayed in self.relayed.items():
+            if relayed.stream.stream.definition_hash == digest:
+                self.objects.redescribe(identity, now=now)
         for client, other in self.links.items():
             self.clients.attempt(client, now, partial(other.definition_known, digest, now=now))
 

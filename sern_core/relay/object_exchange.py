@@ -74,10 +74,14 @@ def check_right(access: AccessTable, client: ClientName, object_id: str) -> None
 
 
 class _Want(NamedTuple):
-    """Objects of a kind (None: any) whose ids match."""
+    """Objects of a kind (None: any) whose ids match, with their values or without."""
 
     kind: ObjectKind | None
     pattern: Pattern
+    valued: bool
+
+    def matches(self, object_id: str, kind: ObjectKind | None) -> bool:
+        return (kind is None or self.kind in (None, kind)) and self.pattern.fullmatch(object_id)
 
 
 class _Owner:
@@ -241,19 +245,22 @@ class ObjectExchange:
         kinds = framing.take_strings(envelope, "kinds", max_length=16)
         patterns = framing.take_strings(envelope, "match")
         since, epoch = framing.take_int(envelope, "since", default=0), framing.take_int(envelope, "epoch", default=0)
+        bare = framing.take_int(envelope, "bare", default=0)
         if len(kinds) != len(patterns) or len(kinds) > MAX_WANTS:
             raise WireError(f"a subscription of {len(kinds)} kinds and {len(patterns)} patterns of objects")
         if not set(kinds) <= _KINDS:
             raise WireError("a subscription to objects of an unknown kind")
         feed = self.feeds.get(client)
-        asked = tuple(zip(kinds, patterns, strict=True))
+        if bare > len(kinds):
+            raise WireError(f"a subscription of {len(kinds)} kinds of objects, {bare} of them without values")
+        asked = (bare, *zip(kinds, patterns, strict=True))
         if feed is not None and self._asked.get(client) == asked:
             return  # it goes on where the session before ended
         link.reassembly.work_us += PATTERN_US * len(patterns)
         try:
             wants = tuple(
-                _Want(ObjectKind(kind) if kind else None, compile_pattern(text))
-                for kind, text in zip(kinds, patterns, strict=True)
+                _Want(ObjectKind(kind) if kind else None, compile_pattern(text), index < len(kinds) - bare)
+                for index, (kind, text) in enumerate(zip(kinds, patterns, strict=True))
             )
         except PatternError as error:
             raise RefusedError("bad_pattern", f"{client} may not subscribe to objects: {error}") from error
@@ -271,6 +278,7 @@ class ObjectExchange:
                 sees=lambda object_id, kind: self._sees(client, object_id, kind),
                 text_of=self._text_of,
                 kinds=told,
+                wants_value=lambda object_id, kind: self._wants_value(client, object_id, kind),
                 first=self._first,
                 now=now,
             )
@@ -278,6 +286,7 @@ class ObjectExchange:
         else:
             feed.kinds, feed.idle = told, False
             feed.restart()
+        feed.bare = not any(want.valued for want in wants)
         feed.pump(now=now)
 
     def _sees(self, client: ClientName, object_id: str, kind: ObjectKind | None) -> bool:
@@ -286,9 +295,12 @@ class ObjectExchange:
             return False  # its own
         wants = self._wants[client]
         self._links[client].reassembly.work_us += LOOK_US * len(wants)
-        if not any((kind is None or want.kind in (None, kind)) and want.pattern.fullmatch(object_id) for want in wants):
+        if not any(want.matches(object_id, kind) for want in wants):
             return False
         return self._access().may_subscribe(client, name_of(object_id))
+
+    def _wants_value(self, client: ClientName, object_id: str, kind: ObjectKind) -> bool:
+        return any(want.valued and want.matches(object_id, kind) for want in self._wants[client])
 
     def pump(self, *, now: float) -> None:
         """Tell those who subscribe what is due. Call ten times a second."""

@@ -27,10 +27,11 @@ OBJECT_BYTES: Final = 512
 
 
 class Selection(NamedTuple):
-    """Objects of a kind (None: any) whose ids match a pattern (full match)."""
+    """Objects of a kind (None: any) whose ids match a pattern (full match). Not `valued`: without their values."""
 
     kind: ObjectKind | None = None
     pattern: str = ".*"
+    valued: bool = True
 
 
 class ObjectListener(Protocol):
@@ -68,7 +69,7 @@ class ObjectMirror:
             )
         for selection in selections:
             compile_pattern(selection.pattern)
-        self.selections = tuple(selections)
+        self.selections = tuple(sorted(selections, key=lambda each: not each.valued))
 
     def send(self, *, now: float) -> None:
         """Tell the relay what is wanted, and what is here. Call in every session that begins, and after `select`."""
@@ -78,6 +79,7 @@ class ObjectMirror:
                     "t": "objects",
                     "kinds": ["" if each.kind is None else str(each.kind) for each in self.selections],
                     "match": [each.pattern for each in self.selections],
+                    "bare": sum(not each.valued for each in self.selections),
                     "since": self._version,
                     "epoch": self._epoch,
                 },

@@ -9,7 +9,7 @@ from typing import Annotated, Final, Literal, Self
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from sern_core.objects.registry import COMMAND_OBJECT_TYPES
-from sern_core.site.object_mirror import MAX_WANTS, Selection
+from sern_core.site.object_mirror import Selection
 from sern_core.site.services import ServiceRule, subscriptions
 from sern_core.summaries.spec import TooLarge
 from sern_core.topics.patterns import MAX_CLIENT_PROGRAM, PatternError, PatternSet, compile_pattern
@@ -56,6 +56,7 @@ from sern_runtime.config.base import (
 from sern_runtime.config.endpoints import EndpointSection, RclpyEndpoint
 from sern_runtime.config.link_state import LinkStateSection
 from sern_runtime.config.load import Loaded, load
+from sern_runtime.config.objects import MAX_SELECTIONS, TOPIC_KINDS, ObjectSelection
 from sern_runtime.config.scene import SceneSection
 from sern_runtime.config.shared import (
     ClassWord,
@@ -428,20 +429,6 @@ class ActionsSection(Section):
         return tuple(section.under(part) for section in self.use for part in ("result", ACTION_STATE))
 
 
-class ObjectSelection(Section):
-    """Cross-reality objects of others that this site wants."""
-
-    kind: (
-        Literal["topic", "transform", "node", "robot", "obstacle", "terrain", "patch", "discrepancy", "command"] | None
-    ) = None
-    """Only objects of this kind; null: of any."""
-    match: Pattern = ".*"
-    """Only objects whose whole id matches, such as twin/.* or /jackal1/odom@jackal1."""
-
-    def selection(self) -> Selection:
-        return Selection(None if self.kind is None else ObjectKind(self.kind), self.match)
-
-
 class ClientFile(FileModel):
     """Configuration of one client daemon."""
 
@@ -461,7 +448,10 @@ class ClientFile(FileModel):
     """Rules for topics, first match wins. A topic without a rule: bulk, best effort, depth 1, lifespan 1 s."""
     subscribe: tuple[Pattern, ...] = ()
     """Regular expressions for the whole global names that this site wants, beside rules with direction `receive`."""
-    objects: Annotated[tuple[ObjectSelection, ...], Field(max_length=MAX_WANTS - 1)] = ()
+    on_demand: tuple[Pattern, ...] = ()
+    """Regular expressions for the whole global names that people at this site may look at (endpoints of kinds foxglove
+    and unity): such a topic comes while somebody looks at it, and no longer. What `subscribe` names comes always."""
+    objects: Annotated[tuple[ObjectSelection, ...], Field(max_length=MAX_SELECTIONS)] = ()
     """Cross-reality objects that this site wants, as far as the relay's access rules let it have them: robots,
     obstacles, patches, nodes, and topics with their latest values. It has them under /api/site_objects."""
     scene: SceneSection | None = None
@@ -557,12 +547,15 @@ class ClientFile(FileModel):
         return tuple(dict.fromkeys((*self.subscribe, *received, *services, *self.actions.patterns())))
 
     def object_selections(self) -> tuple[Selection, ...]:
-        """What to ask the relay for of objects: `objects`, and the patches and discrepancies of the scene."""
+        """What to ask the relay for of objects: `objects`, the patches and discrepancies of the scene, and which topics
+        there are that people may look at."""
         selections = tuple(section.selection() for section in self.objects)
-        if self.scene is None:
-            return selections
-        of_scene = (ObjectKind.PATCH, ObjectKind.DISCREPANCY)
-        return (*selections, *(Selection(kind, f"/scene/{self.scene.name}/.*") for kind in of_scene))
+        if self.scene is not None:
+            of_scene = (ObjectKind.PATCH, ObjectKind.DISCREPANCY)
+            selections += tuple(Selection(kind, f"/scene/{self.scene.name}/.*") for kind in of_scene)
+        if self.on_demand:
+            selections += tuple(Selection(kind, valued=False) for kind in TOPIC_KINDS)
+        return selections
 
     def placed(self, base_dir: Path) -> Self:
         relay = self.relay.model_copy(update={"endpoint": place(base_dir, self.relay.endpoint)})
@@ -606,6 +599,7 @@ class ClientFile(FileModel):
         for index, topic in enumerate(self.topics):
             yield from pattern_problem(topic.match, ("topics", index, "match"))
         yield from pattern_problems(self.subscribe, ("subscribe",))
+        yield from pattern_problems(self.on_demand, ("on_demand",))
         for key, part in (("services", self.services), ("actions", self.actions)):
             for word in ("offer", "use"):
                 for index, section in enumerate(getattr(part, word)):

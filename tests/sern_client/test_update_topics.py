@@ -1,12 +1,14 @@
 """What a site asks for beside its own patterns follows the grids of patches that are open."""
 
 from collections.abc import AsyncIterator
+from functools import partial
 from typing import Any
 
 import pytest
 
 from sern_client import update_topics
 from sern_client.endpoints.record import RecordEndpoint, RecordOptions
+from sern_client.subscribed import Subscribed
 from sern_client.update_topics import MAX_TOPICS, UpdateTopics
 from sern_core.summaries.grids import GRID_TYPE, UPDATE_TYPE
 from sern_core.vocabulary.message import StreamId, StreamInfo
@@ -31,7 +33,10 @@ class Site:
     def __init__(self) -> None:
         self.patterns: tuple[str, ...] = PATTERNS
         self.told: list[tuple[str, ...]] = []
-        self.topics = UpdateTopics(lambda: self.patterns, self._subscribe)
+        subscribed = Subscribed(self._subscribe)
+        self.topics = UpdateTopics(subscribed.covers, partial(subscribed.add, "updates"))
+        subscribed.begin(PATTERNS)
+        self.told.clear()
 
     def _subscribe(self, patterns: tuple[str, ...]) -> None:
         self.patterns = patterns
@@ -110,7 +115,7 @@ async def test_a_bridge_subscribes_as_grids_come_and_go(tmp_path: Any, monkeypat
     shell = Shell()
     bridge = bridge_of(endpoint, shell=shell)
     core = bridge.core
-    core.subscribe(("/evil/.*/map",), now=0.0)
+    bridge.inbound.subscribed.begin(("/evil/.*/map",))
 
     def of(topic: TopicName, kind: str, number: int) -> StreamInfo:
         attributes = {"summary": "patches", "summary_of": stream(number).topic}

@@ -237,6 +237,39 @@ def test_topics_are_objects_too_with_their_definitions_once() -> None:
     checked(world)
 
 
+def test_what_is_wanted_without_its_value_is_told_once_however_often_that_changes() -> None:
+    world = World()
+    robot, site, story = pair(world, [Selection(ObjectKind.TOPIC, valued=False), Selection(ObjectKind.OBSTACLE)])
+    info = TopicInfo(TopicName("/robot/a"), "std_msgs/msg/String", Encoding.CDR, "RIHS01_0", "string data")
+    channel = robot.core.publish(info, spec(latched=True, reliable=True), now=robot.now)
+    put(robot, "robot/box", b"1")
+    world.run(1.0)
+    before = story.told.copy()
+    assert set(before) == {("/robot/a@robot", None), ("robot/box", b"1")}
+    for number in range(50):
+        robot.send(channel, b"body %d" % number)
+        world.run(0.05)
+    put(robot, "robot/box", b"2")
+    world.run(1.0)
+    assert story.told == [*before, ("robot/box", b"2")]
+    topic = site.core.mirror.objects["/robot/a@robot"]
+    assert (topic.value_bytes, topic.seq, topic.definition) == (-1, 0, "string data")
+    site.core.subscribe_objects([Selection(ObjectKind.TOPIC)], now=site.now)
+    world.run(1.0)
+    assert values(site) == {"/robot/a@robot": b"body 49"}
+    checked(world)
+
+
+def test_an_object_that_is_wanted_without_its_value_and_with_it_is_told_with_it() -> None:
+    world = World()
+    robot, site, _story = pair(world, [Selection(ObjectKind.OBSTACLE, valued=False), Selection(None, "robot/b.*")])
+    put(robot, "robot/box", b"1")
+    put(robot, "robot/wall", b"1")
+    world.run(1.0)
+    assert values(site) == {"robot/box": b"1", "robot/wall": None}
+    checked(world)
+
+
 def test_a_pose_passes_the_objects_that_wait() -> None:
     """256 kbit/s: forty kilobytes of objects take over a second, and a pose waits for a datagram or two of them."""
     thin = LinkModel(rate_bps=256_000.0, delay_s=0.02)

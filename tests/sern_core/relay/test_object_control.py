@@ -157,7 +157,12 @@ def test_a_subscription_that_is_none_ends_the_session_or_is_denied() -> None:
     peer.control({"t": "objects", "kinds": [""], "match": ["(a"]})
     assert [code for code, _text in world.relay.refusals] == ["bad_pattern"]
     assert peer.hub.links[ClientName("robot")].established
-    for wrong in ({"kinds": ["thing"], "match": [".*"]}, {"kinds": [""]}, {"kinds": [""] * 25, "match": [".*"] * 25}):
+    for wrong in (
+        {"kinds": ["thing"], "match": [".*"]},
+        {"kinds": [""]},
+        {"kinds": [""] * 25, "match": [".*"] * 25},
+        {"kinds": [""], "match": [".*"], "bare": 2},
+    ):
         again = Owner(World())
         with pytest.raises(WireError, match="a subscription"):
             again.control({"t": "objects", **wrong})
