@@ -18,6 +18,7 @@ from sern_runtime.config.client import ClientFile
 from sern_runtime.config.foxglove import FoxgloveEndpoint
 from sern_runtime.config.load import Loaded
 from sern_runtime.config.twin import TwinEndpoint
+from sern_runtime.config.unity import UnityEndpoint
 from sern_runtime.ros_files import installed_files
 
 _log = logging.getLogger(__name__)
@@ -113,6 +114,8 @@ def local_encoding(model: ClientFile) -> Encoding:
         cdr = first.path.endswith(".mcap")
     elif isinstance(first, sections.SyntheticEndpoint | TwinEndpoint | FoxgloveEndpoint):
         cdr = first.encoding == "cdr"
+    elif isinstance(first, UnityEndpoint):
+        cdr = first.protocol == "ros2"
     return Encoding.CDR if cdr else Encoding.ROS1
 
 

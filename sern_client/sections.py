@@ -11,6 +11,7 @@ from sern_runtime.config import endpoints as sections
 from sern_runtime.config.base import EndpointBase
 from sern_runtime.config.foxglove import FoxgloveEndpoint, installing_foxglove
 from sern_runtime.config.twin import TwinEndpoint
+from sern_runtime.config.unity import UnityEndpoint
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -50,6 +51,11 @@ def make_section(
             return _twin(section, resolve)
         case FoxgloveEndpoint():
             return _foxglove(section, resolve)
+        case UnityEndpoint():
+            from sern_client.endpoints.unity.endpoint import UnityEndpoint as Unity
+            from sern_client.endpoints.unity.options import UnityOptions
+
+            return Unity(options_of(UnityOptions, section, resolve))
         case sections.SyntheticEndpoint():
             from sern_client.endpoints.synthetic import SyntheticEndpoint, SyntheticOptions
 

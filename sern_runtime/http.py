@@ -132,7 +132,7 @@ class HttpServer:
             await web.TCPSite(runner, self._host, self._port).start()
         except OSError as error:
             await self.stop()
-            raise ConfigError(f"cannot listen on http://{self.listen}: {_problem(error)}") from error
+            raise ConfigError(f"cannot listen on http://{self.listen}: {bind_problem(error)}") from error
 
     async def stop(self) -> None:
         if self._runner is not None:
@@ -163,7 +163,8 @@ class HttpServer:
         return web.Response(body=b"".join(parts), headers={"Content-Type": content_type})
 
 
-def _problem(error: OSError) -> str:
+def bind_problem(error: OSError) -> str:
+    """Why nobody can listen there, and what to do."""
     # The loop wraps the cause in its own words; the number is what can be relied on.
     match error.errno:
         case errno.EADDRINUSE:

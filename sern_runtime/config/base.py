@@ -280,6 +280,14 @@ def resolve(base_dir: Path, text: str) -> Path:
     return base_dir / Path(text).expanduser()
 
 
+def missing_directories(base_dir: Path, paths: tuple[str, ...], loc: Loc) -> Iterator[FileProblem]:
+    """A problem for each of the paths that is no directory."""
+    for index, text in enumerate(paths):
+        path = resolve(base_dir, text)
+        if not path.is_dir():
+            yield FileProblem((*loc, index), f"{path}: no such directory")
+
+
 def unit_problems(base_dir: Path, path: Path, loc: Loc) -> Iterator[FileProblem]:
     """A warning of a file that the daemon is to write where the units of `deploy` let it write nothing: by the place of
     the configuration it is one of theirs, or the file is beside those that are."""

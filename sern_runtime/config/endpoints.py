@@ -28,6 +28,7 @@ from sern_runtime.config.base import (
     SecondsOrZero,
     TopicText,
     fault,
+    missing_directories,
     pattern_problems,
     resolve,
     unexpected,
@@ -36,6 +37,7 @@ from sern_runtime.config.base import (
 )
 from sern_runtime.config.foxglove import FoxgloveEndpoint
 from sern_runtime.config.twin import TwinEndpoint
+from sern_runtime.config.unity import UnityEndpoint
 from sern_runtime.config.yaml import Loc
 
 MAX_SYNTHETIC_TOPICS = 20
@@ -367,14 +369,6 @@ class RclpyEndpoint(EndpointBase):
         yield from missing_directories(base_dir, self.type_paths, (*loc, "type_paths"))
 
 
-def missing_directories(base_dir: Path, paths: tuple[str, ...], loc: Loc) -> Iterator[FileProblem]:
-    """A problem for each of the paths that is no directory."""
-    for index, text in enumerate(paths):
-        path = resolve(base_dir, text)
-        if not path.is_dir():
-            yield FileProblem((*loc, index), f"{path}: no such directory")
-
-
 EndpointSection = Annotated[
     BagEndpoint
     | SyntheticEndpoint
@@ -384,6 +378,7 @@ EndpointSection = Annotated[
     | ZenohEndpoint
     | RclpyEndpoint
     | TwinEndpoint
-    | FoxgloveEndpoint,
+    | FoxgloveEndpoint
+    | UnityEndpoint,
     Field(discriminator="kind"),
 ]

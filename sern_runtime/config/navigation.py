@@ -28,6 +28,7 @@ from sern_runtime.config.base import (
     Section,
     TopicText,
     fault,
+    missing_directories,
     resolve,
     unexpected,
 )
@@ -37,7 +38,6 @@ from sern_runtime.config.endpoints import (
     Ros1Endpoint,
     ZenohEndpoint,
     installing,
-    missing_directories,
     missing_package,
 )
 from sern_runtime.config.load import Loaded, load

@@ -1,0 +1,1 @@
+"""Unity scenes at a site: the protocol of ROS-TCP-Connector."""
