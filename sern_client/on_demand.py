@@ -63,8 +63,8 @@ class OnDemand:
     # What there is
 
     def changed(self, item: XrObject) -> None:
-        """There is an object, or it is described otherwise. One without encoding is no topic: a transform names the topic
-        that it came by."""
+        """There is an object, or it is described otherwise. One without encoding is no topic: a transform names the
+        topic that it came by."""
         name = TopicName(item.attributes.get("topic", ""))
         if (
             not name

@@ -12,12 +12,9 @@ Whatever happens, no process and no temporary file is left: children are stopped
 import asyncio
 import math
 import shlex
-import signal
 import sys
-import tempfile
 import time
-from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import partial
@@ -32,12 +29,13 @@ from rich.console import Console
 from sern_core.vocabulary.errors import ConfigError, SernError
 from sern_runtime.config.endpoints import installing
 from sern_runtime.profiles import load_profile
-from sern_tools import demo_charts, demo_report
+from sern_tools import demo_charts, demo_report, demo_view
 from sern_tools.counters import Counters, read_counters
 from sern_tools.demo_behaviour import Behaviour, Look
 from sern_tools.demo_link import LinkProcess
 from sern_tools.demo_live import LiveView, Sample, join
 from sern_tools.demo_report import Carried, Report
+from sern_tools.demo_running import START_S, cancelled_by_signals, get_json, is_ready, working_directory
 from sern_tools.demo_scenario import (
     COMMAND_TOPIC,
     CONTROL_OVERTAKEN_LIMIT,
@@ -51,7 +49,7 @@ from sern_tools.demo_scenario import (
     Scenario,
     write_files,
 )
-from sern_tools.harness.processes import DRAIN_S, Child, Children, program, python, swept
+from sern_tools.harness.processes import DRAIN_S, Child, Children, program, python
 from sern_tools.message_log import TopicLog, read_logs
 from sern_tools.ports import free_ports
 from sern_tools.processors import ProcessorTime, crowded
@@ -65,8 +63,6 @@ EXIT_INTERRUPTED: Final = 130
 IDLE_S: Final = 2.0
 """How long the idle link is measured."""
 POLL_S: Final = 0.5
-START_S: Final = 120.0
-"""Time for the daemons to be ready and for the first message to arrive, also where the machine is small and busy."""
 TAIL_S: Final = 3.0
 """After the load has ended, what is under way may still arrive for so long."""
 SERN_NAME: Final = "SERN"
@@ -342,23 +338,6 @@ async def _probed(robot: Child, site: Child) -> bool:
 # What the daemons say over HTTP ---------------------------------------------------------------------------------------
 
 
-async def get_json(session: aiohttp.ClientSession, url: str) -> Any:
-    """The JSON there, or None while the daemon does not answer (it may be busy, or not there yet)."""
-    try:
-        async with session.get(url) as response:
-            return await response.json() if response.status == 200 else None
-    except (aiohttp.ClientError, TimeoutError, ValueError):
-        return None
-
-
-async def is_ready(session: aiohttp.ClientSession, url: str) -> bool:
-    try:
-        async with session.get(f"{url}/readyz") as response:
-            return response.status == 200
-    except (aiohttp.ClientError, TimeoutError):
-        return False
-
-
 async def _arriving(session: aiohttp.ClientSession, url: str) -> bool:
     topics = await get_json(session, f"{url}/api/topics") or {}
     return any(counters.get("delivered") for name, counters in topics.items() if name != COMMAND_TOPIC)
@@ -407,27 +386,6 @@ def _with_links(sample: Sample, links: Sequence[Mapping[str, Any]]) -> Sample:
 
 
 # The command ----------------------------------------------------------------------------------------------------------
-
-
-@contextmanager
-def working_directory(out: Path, name: str, *, keep: bool) -> Iterator[Path]:
-    """A new folder for a run: in `out` where it is kept, else one that is gone afterwards."""
-    if keep:
-        path = out / f"{name}-{datetime.now().strftime('%Y%m%d-%H%M%S')}"
-        path.mkdir(parents=True)
-        yield path
-        return
-    with swept(Path(tempfile.mkdtemp(prefix="sern-demo-"))) as path:
-        yield path
-
-
-def cancelled_by_signals() -> None:
-    """Have Ctrl-C, SIGTERM and SIGHUP cancel the task that runs now."""
-    task = asyncio.current_task()
-    assert task is not None
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        loop.add_signal_handler(number, task.cancel)
 
 
 async def run(options: Options, console: Console) -> int:
@@ -481,8 +439,6 @@ def demo(
             raise ConfigError(f"--picture needs matplotlib: {installing('matplotlib')}")
         scenario = Scenario(link, duration or link.duration_s, overload=overload, seed=seed, bag=bag)
         if view is not None:
-            from sern_tools import demo_view  # which is made of this module
-
             asyncio.run(demo_view.look(demo_view.ViewOptions(view, scenario, profiles, out, keep), console))
         options = Options(
             scenario=scenario,

@@ -26,15 +26,15 @@ from sern_runtime.config.endpoints import installing
 from sern_runtime.profiles import load_profile
 from sern_sim.profiles import LinkProfile
 from sern_tools import demo_navigation_report as reporting
-from sern_tools.demo import (
+from sern_tools.demo_link import LinkProcess
+from sern_tools.demo_promises import conclude
+from sern_tools.demo_running import (
     START_S,
     cancelled_by_signals,
     get_json,
     is_ready,
     working_directory,
 )
-from sern_tools.demo_link import LinkProcess
-from sern_tools.demo_promises import conclude
 from sern_tools.demo_scenario import FAR_HOST, HOST
 from sern_tools.harness.files import Content, client_content, relay_content, write
 from sern_tools.harness.processes import Children, program, python

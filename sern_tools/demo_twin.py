@@ -24,15 +24,15 @@ from sern_runtime.profiles import load_profile
 from sern_sim.profiles import LinkProfile
 from sern_sim.robot import Pose2
 from sern_tools import demo_twin_report as reporting
-from sern_tools.demo import (
+from sern_tools.demo_link import LinkProcess
+from sern_tools.demo_promises import conclude
+from sern_tools.demo_running import (
     START_S,
     cancelled_by_signals,
     get_json,
     is_ready,
     working_directory,
 )
-from sern_tools.demo_link import LinkProcess
-from sern_tools.demo_promises import conclude
 from sern_tools.demo_scenario import FAR_HOST, HOST
 from sern_tools.demo_twin_report import Sample, TwinReport, judged
 from sern_tools.harness.files import Content, client_content, relay_content, write

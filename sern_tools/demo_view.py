@@ -19,9 +19,9 @@ import aiohttp
 from rich.console import Console
 
 from sern_core.vocabulary.errors import ConfigError
-from sern_tools.demo import START_S, cancelled_by_signals, get_json, is_ready, working_directory
 from sern_tools.demo_link import LinkProcess
 from sern_tools.demo_live import rate
+from sern_tools.demo_running import START_S, cancelled_by_signals, get_json, is_ready, working_directory
 from sern_tools.demo_scenario import CLOUD_LIFESPAN_S, FAR_HOST, HOST, RELAY, ROBOT, SITE, Scenario
 from sern_tools.harness.files import Content, client_content, relay_content, write
 from sern_tools.harness.processes import Children, program

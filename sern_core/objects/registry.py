@@ -151,13 +151,16 @@ class ObjectRegistry:
             self._owned.setdefault(owner, set()).add(object_id)
         self._values.count(entry, fixed_bytes - entry.fixed_bytes)
         entry.fixed_bytes = fixed_bytes
+        definition_hash = definition_hash or text_hash(definition)
+        told = kind, type_name, definition, definition_hash, fields
+        redescribed = not entry.version or told != _description(entry)
         if entry.kind is not kind:
             del self._by_kind[entry.kind][object_id]
             self._by_kind[kind][object_id] = entry
             entry.kind = kind
         entry.type_name = type_name
         entry.definition = definition
-        entry.definition_hash = definition_hash or text_hash(definition)
+        entry.definition_hash = definition_hash
         entry.attributes = MappingProxyType(fields)
         if value is not None:
             self._values.keep(entry, value)
@@ -165,7 +168,8 @@ class ObjectRegistry:
             entry.ros_stamp_ns = ros_stamp_ns
         entry.wall_ns = wall_ns
         self._touch(entry, now)
-        entry.described = self.described_version = entry.version
+        if redescribed:
+            entry.described = self.described_version = entry.version
         return self._seen(entry)
 
     def put_stream(self, stream: StreamInfo, *, wall_ns: int, now: float) -> XrObject:
@@ -511,6 +515,10 @@ class ObjectRegistry:
             updated_s=entry.updated_s,
             version=entry.version,
         )
+
+
+def _description(entry: Entry) -> tuple[object, ...]:
+    return entry.kind, entry.type_name, entry.definition, entry.definition_hash, entry.attributes
 
 
 def _utf8(text: str) -> bytes:

@@ -262,11 +262,18 @@ def test_what_is_wanted_without_its_value_is_told_once_however_often_that_change
 
 def test_an_object_that_is_wanted_without_its_value_and_with_it_is_told_with_it() -> None:
     world = World()
-    robot, site, _story = pair(world, [Selection(ObjectKind.OBSTACLE, valued=False), Selection(None, "robot/b.*")])
+    robot, site, story = pair(world, [Selection(ObjectKind.OBSTACLE, valued=False), Selection(None, "robot/b.*")])
     put(robot, "robot/box", b"1")
     put(robot, "robot/wall", b"1")
     world.run(1.0)
     assert values(site) == {"robot/box": b"1", "robot/wall": None}
+    told = len(story.told)
+    put(robot, "robot/wall", b"2")
+    world.run(1.0)
+    assert len(story.told) == told, "it has another value, and is what it was"
+    put(robot, "robot/wall", b"2", kind=ObjectKind.TERRAIN)
+    world.run(1.0)
+    assert "robot/wall" not in values(site), "it is of a kind that nobody asked for"
     checked(world)
 
 
