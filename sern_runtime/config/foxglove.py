@@ -5,22 +5,21 @@ import ssl
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final, Literal
 
-from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from sern_runtime.config.base import (
     EndpointBase,
     FileProblem,
     HttpListen,
     PathText,
-    Pattern,
     fault,
     is_local,
     pattern_problems,
     resolve,
-    unexpected,
 )
+from sern_runtime.config.viewing import Publishable
 from sern_runtime.config.yaml import Loc
 
 PACKAGE: Final = "foxglove"
@@ -48,14 +47,6 @@ def _check_origin(text: str) -> str:
     return text.lower()
 
 
-def _publish_tag(value: Any) -> str | None:
-    """Which member of the union a value of `publish` is meant to be."""
-    return "bool" if isinstance(value, bool) else "list" if isinstance(value, (list, tuple)) else None
-
-
-_PUBLISH_EXPECTED: Final = unexpected("true, false or a list of patterns")
-
-
 class FoxgloveEndpoint(EndpointBase):
     """Foxglove and Lichtblick, or whatever speaks the Foxglove WebSocket protocol: they connect to this client and look
     at topics of other sites. Needs the extra `foxglove` (`'.[foxglove]'` where SERN is installed)."""
@@ -76,15 +67,7 @@ class FoxgloveEndpoint(EndpointBase):
     )
     """Web pages that may connect without a token, by scheme, host and port; beside them desktop applications, programs,
     and pages of this machine's loopback. Any other page that is open in a browser here is refused."""
-    publish: Annotated[
-        Annotated[bool, Tag("bool")] | Annotated[tuple[Pattern, ...], Tag("list")],
-        Discriminator(
-            _publish_tag,
-            custom_error_type=_PUBLISH_EXPECTED.type,
-            custom_error_message=_PUBLISH_EXPECTED.message_template,
-            custom_error_context=_PUBLISH_EXPECTED.context,
-        ),
-    ] = False
+    publish: Publishable = False
     """What viewers may publish: true: any topic, or patterns of names. By default nothing: who looks does not drive."""
     encoding: Literal["ros1", "cdr"] = "cdr"
     """How messages are serialised that viewers send as JSON: `ros1` or `cdr` (ROS 2). The far side converts them."""
