@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-ENDPOINTS = ("bag", "dds", "foxglove", "rclpy", "record", "ros1", "synthetic", "zenoh")
+ENDPOINTS = ("bag", "dds", "foxglove", "rclpy", "record", "ros1", "synthetic", "unity", "zenoh")
 SHOWN = "import sys, {program}; print(*sys.modules)"
 
 

@@ -16,6 +16,8 @@ from ruamel.yaml import YAML
 
 from sern_client.endpoints.foxglove.endpoint import FoxgloveEndpoint
 from sern_client.endpoints.foxglove.options import FoxgloveOptions
+from sern_client.endpoints.unity.endpoint import UnityEndpoint
+from sern_client.endpoints.unity.options import UnityOptions
 from sern_client.navigation.metrics import register_navigation
 from sern_client.navigation.node import NavigationNode
 from sern_client.navigation.options import NodeOptions
@@ -61,7 +63,9 @@ def navigation() -> str:
 def viewers() -> str:
     """What an endpoint at which people look says of itself."""
     registry = CollectorRegistry()
-    FoxgloveEndpoint(FoxgloveOptions()).register_metrics(Metrics(registry))
+    metrics = Metrics(registry)
+    FoxgloveEndpoint(FoxgloveOptions()).register_metrics(metrics)
+    UnityEndpoint(UnityOptions()).register_metrics(metrics)
     return generate_latest(registry).decode()
 
 
