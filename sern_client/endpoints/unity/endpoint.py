@@ -33,6 +33,7 @@ from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.names import topic_name
 from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types
+from sern_runtime.config.base import is_local
 from sern_runtime.http import bind_problem, parse_listen
 from sern_runtime.ros_files import installed_files
 
@@ -114,12 +115,14 @@ class UnityEndpoint:
         metrics.counter("sern_unity_faults_total", "What scenes did wrong.", (), lambda: [((), self.faults)])
 
     async def start(self, events: TopicEvents) -> None:
-        """ConfigError when the port is taken."""
+        """ConfigError when the port is taken, or open to the network and not meant to be."""
         options = self.options
         patterns = PatternSet([".*"] if options.publish is True else options.publish or ())
         self._published = PublishedTopics("scenes", patterns.fullmatch, events)
         self._topics = Topics(options.encoding, self._viewed, lambda: self.scenes)
         host, port = parse_listen(options.listen)
+        if not (options.allow_remote or is_local(f"tcp://{options.listen}")):
+            raise ConfigError(f"endpoint unity: {options.listen} is open to the network; set allow_remote for that")
         try:
             self._server = await asyncio.start_server(self._connected, host, port)
         except OSError as error:

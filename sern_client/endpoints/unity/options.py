@@ -12,6 +12,7 @@ class UnityOptions:
     """Each as the key of its name in the configuration file."""
 
     listen: str = "127.0.0.1:10000"
+    allow_remote: bool = False
     protocol: Literal["ros1", "ros2"] = "ros2"
     publish: bool | tuple[str, ...] = False
     type_paths: tuple[Path, ...] = ()

@@ -19,6 +19,7 @@ from sern_client.endpoints.record import RecordOptions
 from sern_client.endpoints.ros1 import Ros1Options
 from sern_client.endpoints.synthetic import SyntheticOptions
 from sern_client.endpoints.twin.options import RobotOptions, TwinOptions
+from sern_client.endpoints.unity.options import UnityOptions
 from sern_client.endpoints.zenoh.options import ZenohOptions
 from sern_client.sections import make_section, options_of
 from sern_core.vocabulary.errors import ConfigError
@@ -36,6 +37,7 @@ from sern_runtime.config.endpoints import (
 )
 from sern_runtime.config.foxglove import FoxgloveEndpoint
 from sern_runtime.config.twin import TwinEndpoint, TwinRobot, TwinView
+from sern_runtime.config.unity import UnityEndpoint
 
 PAIRS = [
     (BagEndpoint, BagOptions),
@@ -47,6 +49,7 @@ PAIRS = [
     (RclpyEndpoint, RclpyOptions),
     (TwinEndpoint, TwinOptions),
     (FoxgloveEndpoint, FoxgloveOptions),
+    (UnityEndpoint, UnityOptions),
 ]
 SAID_BY_NO_FILE = {"second", "publishes_only", "enclave", "as_node"}
 OTHERWISE_BY_DEFAULT = {(DdsOptions, "domain")}

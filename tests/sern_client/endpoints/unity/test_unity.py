@@ -406,6 +406,13 @@ async def test_a_second_endpoint_on_the_same_port_is_one_line(stack: AsyncExitSt
     await second.stop()
 
 
+async def test_the_network_is_let_in_only_where_that_is_meant() -> None:
+    endpoint = UnityEndpoint(UnityOptions(listen="0.0.0.0:0"))
+    with pytest.raises(ConfigError, match=r"0\.0\.0\.0:0 is open to the network"):
+        await endpoint.start(Events())
+    await endpoint.stop()
+
+
 async def test_no_more_scenes_than_so_many(stack: AsyncExitStack, caplog: pytest.LogCaptureFixture) -> None:
     here = await place(stack, max_connections=1)
     first = await here.scene()
