@@ -113,7 +113,8 @@ performance: setup
 endpoints: setup
 	mkdir -p build
 	$(BIN)/python -m benchmarks.endpoints --json build/endpoints.json
-	$(BIN)/python -m benchmarks.document build/endpoints.json
+	$(BIN)/python -m benchmarks.viewers --json build/viewers.json
+	$(BIN)/python -m benchmarks.document build/endpoints.json build/viewers.json
 
 # Neither root nor ROS is needed.
 figures: setup

@@ -21,7 +21,7 @@ from typing import Any, Final, NamedTuple
 
 import uvloop
 
-from benchmarks import common
+from benchmarks import common, viewers_link
 from benchmarks.common import Report
 from sern_core.vocabulary.errors import SernError
 from sern_core.vocabulary.message import TopicInfo
@@ -212,6 +212,7 @@ def run(options: argparse.Namespace, report: Report) -> None:
     cpu = [report.value(case, system, "cpu_percent") for system in SYSTEMS]
     report.reach("CPU by that of the SDK's bare server", cpu[0] / cpu[1], CPU_LIMIT)
     report.reach("messages that a viewer got, %", report.value(case, ours, "got_percent"), 100.0, at_least=True)
+    asyncio.run(viewers_link.measure(report, seconds=2.0 if options.quick else 10.0, times=3 if options.quick else 50))
 
 
 def _metrics(seen: Seen, duration_s: float) -> dict[str, float]:
