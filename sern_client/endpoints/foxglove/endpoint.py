@@ -7,7 +7,6 @@ viewer, through the `door` (who may come in, what a slow one misses) to the SDK'
 import asyncio
 import logging
 from collections import Counter
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from sern_client.endpoints.base import (
@@ -20,9 +19,9 @@ from sern_client.endpoints.base import (
     Sink,
     Subscription,
     TopicEvents,
-    TopicNews,
     Viewed,
 )
+from sern_client.endpoints.common.viewed import NothingOnDemand
 from sern_client.endpoints.foxglove.board import Board, TopicPublisher
 from sern_client.endpoints.foxglove.definitions import Described
 from sern_client.endpoints.foxglove.door import Door, Shared, tls_context
@@ -46,23 +45,13 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
-class _Nobody:
-    """The `Viewed` of a client that asks for nothing on demand: what comes is what its file subscribes to."""
-
-    def want(self, name: TopicName, wanted: bool) -> None:
-        """Nothing to do: it comes, or it does not."""
-
-    def topics(self) -> Sequence[TopicNews]:
-        return ()
-
-
 class FoxgloveEndpoint:
     """An `Endpoint`, a `ViewingEndpoint` and a `ServiceEndpoint`."""
 
     def __init__(self, options: FoxgloveOptions) -> None:
         self.options = options
         self.shared = Shared()
-        self._viewed: Viewed = _Nobody()
+        self._viewed: Viewed = NothingOnDemand()
         self._server = Server()
         self._door = Door(self.shared, Rules(options.token, options.origins), max_bytes=options.max_waiting_bytes)
         self._services = Services(self._server)

@@ -3,7 +3,6 @@
 import asyncio
 import logging
 from collections import Counter
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from sern_client.endpoints.base import (
@@ -16,11 +15,11 @@ from sern_client.endpoints.base import (
     Sink,
     Subscription,
     TopicEvents,
-    TopicNews,
     Viewed,
 )
 from sern_client.endpoints.common.published import PublishedTopics
 from sern_client.endpoints.common.saying import SayOnce
+from sern_client.endpoints.common.viewed import NothingOnDemand
 from sern_client.endpoints.unity import framing
 from sern_client.endpoints.unity.framing import Command, Frame
 from sern_client.endpoints.unity.options import UnityOptions
@@ -45,16 +44,6 @@ _SLASH: Final = "/"
 _log = logging.getLogger(__name__)
 
 
-class _Nobody:
-    """The `Viewed` of a client that asks for nothing on demand."""
-
-    def want(self, name: TopicName, wanted: bool) -> None:
-        """Nothing to do: it comes, or it does not."""
-
-    def topics(self) -> Sequence[TopicNews]:
-        return ()
-
-
 class UnityEndpoint:
     """An `Endpoint`, a `ViewingEndpoint` and a `ServiceEndpoint`."""
 
@@ -68,7 +57,7 @@ class UnityEndpoint:
         self.scenes: dict[Scene, asyncio.Task[Any]] = {}
         self.services = Services(options.encoding, installed_files(options.type_paths))
         self._say = SayOnce(_log)
-        self._viewed: Viewed = _Nobody()
+        self._viewed: Viewed = NothingOnDemand()
         self._topics: Topics | None = None
         self._published: PublishedTopics | None = None
         self._server: asyncio.Server | None = None
