@@ -34,7 +34,9 @@ from sern_client.endpoints.base import (
     Sink,
     Subscription,
     TopicEvents,
+    ViewingEndpoint,
     keepers_of,
+    viewers_of,
 )
 from sern_client.endpoints.common.saying import SayOnce
 from sern_client.endpoints.conversion import Converter, HasConverter, serve
@@ -228,6 +230,10 @@ class ActionEndpoint:
     @property
     def keepers(self) -> Sequence[KeepingEndpoint]:
         return keepers_of(self.inner)
+
+    @property
+    def viewers(self) -> Sequence[ViewingEndpoint]:
+        return viewers_of(self.inner)
 
     # --- ServiceEndpoint --------------------------------------------------------------------------------------------
 

@@ -2,10 +2,13 @@
 
 from collections.abc import AsyncIterator, Iterable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
-from sern_client.endpoints.base import Viewed
+from sern_client.action_conversion.endpoint import ActionEndpoint
+from sern_client.endpoints.base import Viewed, viewers_of
+from sern_client.endpoints.composite import CompositeEndpoint
 from sern_client.on_demand import MAX_WANTED, OnDemand
 from sern_client.site import Site
 from sern_core.objects.xr_object import XrObject
@@ -13,7 +16,7 @@ from sern_core.topics.patterns import PatternSet, compile_pattern
 from sern_core.topics.rules import Direction, RuleSet, TopicRule
 from sern_core.vocabulary.ledger import ReceiveLedger
 from sern_core.vocabulary.message import TopicInfo
-from sern_core.vocabulary.types import ClientName, ObjectKind, TopicName
+from sern_core.vocabulary.types import ClientName, Encoding, ObjectKind, TopicName
 from tests.bridges import FakeEndpoint
 from tests.support import until
 
@@ -149,3 +152,17 @@ async def test_a_viewer_that_fails_costs_the_others_nothing(case: Case) -> None:
     with pytest.raises(RuntimeError, match="no"):
         case.there("/robot/odom")
     assert case.viewers[0].offered.keys() == {"/robot/odom"}
+
+
+def test_people_look_at_members_of_a_composite_behind_actions_too() -> None:
+    class Looking(FakeEndpoint):
+        use_viewed = Viewer.use_viewed
+        topic_offered = Viewer.topic_offered
+        topic_withdrawn = Viewer.topic_withdrawn
+
+    looking = Looking()
+    both = CompositeEndpoint([FakeEndpoint(), looking])
+    services: Any = both
+    assert viewers_of(looking) == viewers_of(both) == [looking] and viewers_of(FakeEndpoint()) == []
+    behind = ActionEndpoint(both, services, Encoding.CDR, [], namespace="/", files=[])
+    assert viewers_of(behind) == [looking]

@@ -31,4 +31,5 @@ async def test_all_else_passes(tmp_path: Path) -> None:
     site.endpoint.interest(odometry.name, False)
     assert site.events.infos == {odometry.name: odometry} and site.nodes.interests == {odometry.name: False}
     taken.close()
-    assert site.endpoint.encoding is None and site.endpoint.drops == {} and site.endpoint.keepers == []
+    assert site.endpoint.encoding is None and site.endpoint.drops == {}
+    assert site.endpoint.keepers == [] and site.endpoint.viewers == []
