@@ -52,10 +52,7 @@ def make_section(
         case FoxgloveEndpoint():
             return _foxglove(section, resolve)
         case UnityEndpoint():
-            from sern_client.endpoints.unity.endpoint import UnityEndpoint as Unity
-            from sern_client.endpoints.unity.options import UnityOptions
-
-            return Unity(options_of(UnityOptions, section, resolve))
+            return _unity(section, resolve, second=second)
         case sections.SyntheticEndpoint():
             from sern_client.endpoints.synthetic import SyntheticEndpoint, SyntheticOptions
 
@@ -121,6 +118,13 @@ def _foxglove(section: FoxgloveEndpoint, resolve: Resolve) -> Endpoint:
     from sern_client.endpoints.foxglove.options import FoxgloveOptions
 
     return FoxgloveEndpoint(options_of(FoxgloveOptions, section, resolve))
+
+
+def _unity(section: UnityEndpoint, resolve: Resolve, *, second: bool) -> Endpoint:
+    from sern_client.endpoints.unity.endpoint import UnityEndpoint
+    from sern_client.endpoints.unity.options import UnityOptions
+
+    return UnityEndpoint(options_of(UnityOptions, section, resolve, second=second))
 
 
 def _dds(section: sections.DdsEndpoint, resolve: Resolve, *, as_node: bool) -> Endpoint:

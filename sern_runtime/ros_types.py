@@ -57,8 +57,9 @@ _ROS1_BUILTIN: Final = frozenset(
     {"bool", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64"}
     | {"float32", "float64", "string", "time", "duration", "char", "byte"}
 )
-_NO_FIELDS: Final[Fielddefs] = [("structure_needs_at_least_one_member", (Nodetype.BASE, ("uint8", 0)))]
+NO_FIELD: Final = "structure_needs_at_least_one_member"
 """What ROS 2 puts into a type without fields, because IDL has no empty structs; ROS 1 sends nothing for it."""
+_NO_FIELDS: Final[Fielddefs] = [(NO_FIELD, (Nodetype.BASE, ("uint8", 0)))]
 _ONE_BYTE: Final = frozenset({"byte", "char", "int8", "uint8"})
 _BY_VALUE: Final = frozenset(
     {"sensor_msgs/msg/Range", "shape_msgs/msg/SolidPrimitive", "visualization_msgs/msg/Marker"}

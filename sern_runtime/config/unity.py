@@ -1,4 +1,4 @@
-"""The section of an endpoint of kind `unity`: where scenes connect, and what they may do."""
+"""The section of an endpoint of kind `unity`: where scenes of Unity connect to."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,53 +12,55 @@ from sern_runtime.config.base import (
     FileProblem,
     HttpListen,
     PathText,
+    Pattern,
     fault,
     is_local,
     missing_directories,
     pattern_problems,
 )
-from sern_runtime.config.viewing import Publishable
 from sern_runtime.config.yaml import Loc
 
 
 class UnityEndpoint(EndpointBase):
-    """Unity scenes with ROS-TCP-Connector: they connect to this client as to a ROS-TCP-Endpoint, and need no ROS."""
+    """Scenes of Unity with Unity's package ROS-TCP-Connector, which connect to this client as to a ROS-TCP-Endpoint. It
+    needs no ROS and no further package."""
 
     kind: Literal["unity"]
-    """Unity scenes connect here."""
+    """Scenes of Unity."""
     listen: HttpListen = "127.0.0.1:10000"
-    """`address:port` to listen on. The protocol has neither keys nor encryption: elsewhere than on loopback it takes
-    `allow_remote`."""
-    allow_remote: bool = False
-    """Listen elsewhere than on loopback: whoever reaches the port sees and says what a scene may."""
+    """`address:port` that scenes connect to."""
     protocol: Literal["ros1", "ros2"] = "ros2"
-    """As the scene has it under Robotics, ROS Settings, Protocol. Messages of the other ROS are converted."""
-    publish: Publishable = False
-    """What scenes may publish: true: any topic, or patterns of names. By default nothing: who looks does not drive."""
+    """What scenes are compiled for (Robotics, ROS Settings, Protocol): `ros1` or `ros2`. What robots send is converted
+    to it."""
+    allow_remote: bool = False
+    """Listen on an address that others reach. The protocol has neither keys nor encryption: whoever reaches it sees
+    everything and publishes what `publish` names. An SSH tunnel or WireGuard is better."""
+    publish: tuple[Pattern, ...] = ()
+    """Topics (local names) that a scene may publish. None unless named here: nobody who connects has shown who they
+    are, and what they publish may move a robot."""
+    max_connections: Annotated[int, Field(ge=1, le=1000)] = 10
+    """Scenes at once; one more is told so and sent away."""
+    max_message_bytes: Annotated[int, Field(ge=1000, le=1 << 30)] = 64 * 2**20
+    """Longer messages of scenes are dropped and counted."""
+    queue_bytes: Bytes = 64 * 2**20
+    """Bytes that may wait for one slow scene; at least one message always may. Of a best-effort topic only the newest
+    message waits."""
+    stalled_s: Annotated[float, Field(ge=0.1, le=3600)] = 10.0
+    """A scene that reads nothing for so long, while something waits for it, is disconnected; it may come back."""
     type_paths: tuple[PathText, ...] = ()
     """Directories with .msg and .srv files (searched at any depth), for types of scenes that are neither in a ROS 2
-    installation of this machine nor of Jazzy's desktop."""
-    max_connections: Annotated[int, Field(ge=1, le=100)] = 8
-    """Scenes at a time."""
-    max_message_bytes: Annotated[int, Field(ge=1000, le=1 << 30)] = 64 * 2**20
-    """A scene that sends a longer message is disconnected."""
-    max_waiting_bytes: Bytes = 8 * 2**20
-    """What may wait for one scene; beyond, its oldest messages are dropped and counted. Of a topic that is best effort
-    the newest message alone waits."""
-    stalled_s: Annotated[float, Field(ge=1, le=600)] = 10.0
-    """A scene that takes nothing for so long is disconnected."""
+    installation of this machine nor of Jazzy's (`ros1`: Noetic's) desktop."""
 
     @model_validator(mode="after")
-    def _stays_here(self) -> "UnityEndpoint":
+    def _is_for_this_machine(self) -> "UnityEndpoint":
         if not self.allow_remote and not is_local(f"tcp://{self.listen}"):
             raise fault(
-                f"{self.listen} is open to the network, and the protocol has neither keys nor encryption: listen on "
-                "127.0.0.1 and come through an SSH tunnel (ssh -L 10000:127.0.0.1:10000), or set allow_remote: true",
+                f"{self.listen} is open to the network, and the protocol has neither keys nor encryption; listen on "
+                "127.0.0.1 and come through an SSH tunnel (ssh -L) or WireGuard, or set allow_remote: true",
                 "listen",
             )
         return self
 
     def file_problems(self, base_dir: Path, loc: Loc) -> Iterator[FileProblem]:
         yield from missing_directories(base_dir, self.type_paths, (*loc, "type_paths"))
-        if not isinstance(self.publish, bool):
-            yield from pattern_problems(self.publish, (*loc, "publish"))
+        yield from pattern_problems(self.publish, (*loc, "publish"))

@@ -8,6 +8,5 @@ calls       service calls that wait for answers, and those that are being answer
 saying      what is said once, or once until it is over
 ages        how old topics of other sites are, as topics of their own
 held        subscriptions that keep refused messages
-published   topics that whoever connects publishes
 viewed      what is asked where a client has nothing on demand
 """

@@ -1,9 +1,15 @@
-"""The `unity` endpoint: scenes connect, subscribe to topics of other sites, publish, call services and offer them."""
+"""Scenes of Unity as an endpoint: a TCP server that scenes with Unity's ROS-TCP-Connector connect to.
+
+What a scene subscribes to is wanted from other sites, and nothing else comes. What it publishes goes out as any other
+topic of this site, where `publish` names it. Scenes do not hear each other here. The protocol has neither keys nor
+encryption, so the server is for this machine.
+"""
 
 import asyncio
 import logging
 from collections import Counter
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Mapping
+from typing import Final
 
 from sern_client.endpoints.base import (
     Difference,
@@ -11,302 +17,237 @@ from sern_client.endpoints.base import (
     ServiceEvents,
     ServiceHandler,
     ServiceInfo,
-    ServiceServer,
     Sink,
-    Subscription,
     TopicEvents,
     Viewed,
 )
-from sern_client.endpoints.common.published import PublishedTopics
-from sern_client.endpoints.common.saying import SayOnce
-from sern_client.endpoints.common.viewed import NothingOnDemand
-from sern_client.endpoints.unity import framing
-from sern_client.endpoints.unity.framing import Command, Frame
+from sern_client.endpoints.common.interest import OnDemand
+from sern_client.endpoints.unity import commands, names
+from sern_client.endpoints.unity.commands import Command, shown
+from sern_client.endpoints.unity.far_services import FarServices, Served
+from sern_client.endpoints.unity.faults import Fault, Faults
+from sern_client.endpoints.unity.incoming import Incoming, SceneStream
 from sern_client.endpoints.unity.options import UnityOptions
-from sern_client.endpoints.unity.scene import Ended, Scene
-from sern_client.endpoints.unity.services import Services
-from sern_client.endpoints.unity.topics import TopicPublisher, Topics, type_of
-from sern_core.topics.patterns import PatternSet
-from sern_core.vocabulary.errors import ConfigError, UsageError
+from sern_client.endpoints.unity.outbox import Outbox
+from sern_client.endpoints.unity.own_services import OwnServices
+from sern_client.endpoints.unity.publications import Publications
+from sern_client.endpoints.unity.scene import READ_BYTES, Scene, SceneLimits
+from sern_client.endpoints.unity.types import SceneTypes
+from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.message import TopicInfo
-from sern_core.vocabulary.names import topic_name
 from sern_core.vocabulary.types import DropReason, Encoding, TopicName
-from sern_runtime import ros_types
-from sern_runtime.config.base import is_local
-from sern_runtime.http import bind_problem, parse_listen
-from sern_runtime.ros_files import installed_files
+from sern_runtime.metrics import Metrics
 
-if TYPE_CHECKING:
-    from sern_runtime.metrics import Metrics
-
-_SLASH: Final = "/"
+GOODBYE_S: Final = 1.0
+"""How long a scene that is one too many may take to read why."""
 
 _log = logging.getLogger(__name__)
 
 
 class UnityEndpoint:
-    """An `Endpoint`, a `ViewingEndpoint` and a `ServiceEndpoint`."""
+    """An `Endpoint`, `ViewingEndpoint`, `ServiceEndpoint`, `CountingEndpoint` and `MeasuredEndpoint`."""
 
     def __init__(self, options: UnityOptions) -> None:
         self.options = options
-        self.faults = 0
-        """What scenes did wrong."""
-        self.ended: Counter[Ended] = Counter()
-        self.refused = 0
-        """Connections beyond `max_connections`."""
-        self.scenes: dict[Scene, asyncio.Task[Any]] = {}
-        self.services = Services(options.encoding, installed_files(options.type_paths))
-        self._say = SayOnce(_log)
-        self._viewed: Viewed = NothingOnDemand()
-        self._topics: Topics | None = None
-        self._published: PublishedTopics | None = None
+        self.faults = Faults(_log)
+        self._encoding = Encoding.ROS1 if options.protocol == "ros1" else Encoding.CDR
+        self._limits = SceneLimits(options.max_message_bytes, options.queue_bytes, options.stalled_s)
+        self._drops: Counter[DropReason] = Counter()
+        self.types = SceneTypes(self._encoding, options.type_paths)
+        self.incoming = Incoming(self._encoding, self.faults, self._drops, self.types.knows_message)
+        self.publications = Publications(options.publish, self.types, self.faults, self._drops)
+        self.far_services = FarServices(self.types, self.faults, self._drops)
+        self.own_services = OwnServices(self.types, self.faults, self._drops)
+        self.scenes: set[Scene] = set()
         self._server: asyncio.Server | None = None
-        self._early: dict[TopicName, TopicInfo] = {}
-        self._next: dict[Scene, tuple[Command, int]] = {}  # what the next message of a scene is
-        self._lost: Counter[DropReason] = Counter()  # of scenes that have gone
+        self._connections: dict[asyncio.Task[None], Scene] = {}  # also those that are being sent away
+        self._stopping = False
+
+    # --- Endpoint ---------------------------------------------------------------------------------------------------
+
+    async def start(self, events: TopicEvents) -> None:
+        """ConfigError when the address is another's, or none of this machine's."""
+        self.publications.start(events)
+        if self.options.second:
+            return
+        host, port = self.options.place
+        try:
+            self._server = await asyncio.start_server(self._connected, host, port, limit=READ_BYTES)
+        except OSError as error:
+            raise ConfigError(
+                f"unity: cannot listen on {self.options.listen} ({error.strerror}); end what listens there (another "
+                "client, a ROS-TCP-Endpoint), or give `listen` another port"
+            ) from None
+        _log.info("scenes of Unity connect to %s (%s)", self.options.listen, self.options.protocol)
+
+    async def stop(self) -> None:
+        self._stopping = True
+        self.publications.close()
+        if self._server is not None:
+            self._server.close()
+        for scene in self._connections.values():
+            scene.close()
+        await asyncio.gather(*self._connections, return_exceptions=True)
+        if self._server is not None:
+            await self._server.wait_closed()
+        await self.far_services.stop()
+        self.incoming.close()
+
+    def subscribe(self, name: TopicName, sink: Sink) -> OnDemand:
+        return self.publications.subscribe(name, sink)
+
+    def advertise(self, info: TopicInfo) -> SceneStream:
+        return self.incoming.advertise(info)
+
+    def interest(self, name: TopicName, wanted: bool) -> None:
+        """A scene cannot be told; what nobody wants is left here."""
+        self.publications.subscriptions.interest(name, wanted)
+
+    def validate(self, held: Held) -> list[Difference]:
+        found = held.differences(Held(self.incoming.publishers, self.publications.subscriptions.names))
+        if self._server is not None and not self._server.is_serving():
+            found.append(Difference(TopicName(""), f"nothing listens on {self.options.listen}"))
+        return found
 
     @property
     def encoding(self) -> Encoding:
-        return self.options.encoding
+        """A scene is compiled for one of the two."""
+        return self._encoding
 
     @property
     def exhausted(self) -> bool:
         return False
 
-    @property
-    def port(self) -> int:
-        """Where scenes connect, also when port 0 was asked for. Only while started."""
-        assert self._server is not None
-        return int(self._server.sockets[0].getsockname()[1])
-
-    @property
-    def drops(self) -> dict[DropReason, int]:
-        """Messages that a slow scene did not get, and those of scenes that did not go on."""
-        total = Counter(self._lost)
-        for scene in self.scenes:
-            total.update(scene.waiting.dropped)
-        for part in (self._topics, self._published):
-            if part is not None:
-                total.update(part.dropped)
-        return {reason: count for reason, count in total.items() if count}
-
-    def register_metrics(self, metrics: "Metrics") -> None:
-        metrics.gauge("sern_unity_scenes", "Scenes that are connected.", (), lambda: [((), len(self.scenes))])
-        metrics.counter(
-            "sern_unity_ended_total",
-            "Connections of scenes that have ended, by why.",
-            ("reason",),
-            lambda: [((str(why),), self.ended[why]) for why in Ended],
-        )
-        metrics.counter(
-            "sern_unity_refused_total", "Connections beyond max_connections.", (), lambda: [((), self.refused)]
-        )
-        metrics.counter("sern_unity_faults_total", "What scenes did wrong.", (), lambda: [((), self.faults)])
-
-    async def start(self, events: TopicEvents) -> None:
-        """ConfigError when the port is taken, or open to the network and not meant to be."""
-        options = self.options
-        patterns = PatternSet([".*"] if options.publish is True else options.publish or ())
-        self._published = PublishedTopics("scenes", patterns.fullmatch, events)
-        self._topics = Topics(options.encoding, self._viewed, lambda: self.scenes)
-        host, port = parse_listen(options.listen)
-        if not (options.allow_remote or is_local(f"tcp://{options.listen}")):
-            raise ConfigError(f"endpoint unity: {options.listen} is open to the network; set allow_remote for that")
-        try:
-            self._server = await asyncio.start_server(self._connected, host, port)
-        except OSError as error:
-            raise ConfigError(f"endpoint unity: cannot listen on {options.listen}: {bind_problem(error)}") from error
-        for info in self._early.values():
-            self._topics.offered(info)
-        self._early.clear()
-        _log.info("Unity scenes connect to %s:%d (%s)", host, self.port, options.protocol)
-
-    async def stop(self) -> None:
-        if self._server is not None:
-            self._server.close()
-        for scene in self.scenes:
-            scene.end(Ended.STOPPED)
-        await asyncio.gather(*self.scenes.values(), return_exceptions=True)
-        await self.services.close()
-        if self._topics is not None:
-            self._topics.close()
-        if self._published is not None:
-            self._published.close()
-        if self._server is not None:
-            await self._server.wait_closed()
-
-    # Topics of other sites
+    # --- ViewingEndpoint, CountingEndpoint, MeasuredEndpoint --------------------------------------------------------
 
     def use_viewed(self, viewed: Viewed) -> None:
-        self._viewed = viewed
+        self.incoming.viewed = viewed
 
     def topic_offered(self, info: TopicInfo) -> None:
-        if self._topics is None:
-            self._early[info.name] = info
-        else:
-            self._topics.offered(info)
+        self.incoming.offered(info)
 
     def topic_withdrawn(self, name: TopicName) -> None:
-        self._early.pop(name, None)
-        if self._topics is not None:
-            self._topics.withdrawn(name)
+        self.incoming.withdrawn(name)
 
-    def advertise(self, info: TopicInfo) -> TopicPublisher:
-        if self._topics is None:
-            raise UsageError("advertise before start")
-        if info.encoding is not self.options.encoding:
-            raise ConfigError(f"{info.name}: {info.encoding} bodies are no messages of {self.options.protocol}")
-        return self._topics.advertise(info)
+    @property
+    def drops(self) -> Mapping[DropReason, int]:
+        return self._drops
 
-    # Topics of scenes
+    def register_metrics(self, metrics: Metrics) -> None:
+        metrics.gauge("sern_unity_scenes", "Scenes that are connected.", (), lambda: [((), float(len(self.scenes)))])
+        metrics.gauge(
+            "sern_unity_waiting_bytes", "Bytes that wait for scenes.", (),
+            lambda: [((), float(sum(scene.kept_bytes for scene in self.scenes)))],
+        )  # fmt: skip
+        metrics.counter(
+            "sern_unity_faults_total",
+            "What was wrong with what scenes said or asked for, by what it was.",
+            ("fault",),
+            lambda: [((fault,), float(count)) for fault, count in self.faults.counts.items()],
+            known=lambda: [(fault,) for fault in Fault],
+        )
 
-    def subscribe(self, name: TopicName, sink: Sink) -> Subscription:
-        if self._published is None:
-            raise UsageError(f"{name}: no scene publishes such a topic")
-        return self._published.subscribe(name, sink)
-
-    def interest(self, name: TopicName, wanted: bool) -> None:
-        """Makes no difference: a scene publishes all the same, and the link drops what nobody wants."""
-
-    def validate(self, held: Held) -> list[Difference]:
-        here = Held()
-        if self._topics is not None and self._published is not None:
-            here = Held(Counter(each.name for each in self._topics.publishers), self._published.subscriptions)
-        return held.differences(here)
-
-    # Services
+    # --- ServiceEndpoint, KnowsServiceTypes -------------------------------------------------------------------------
 
     def watch_services(self, events: ServiceEvents) -> None:
-        self.services.watch(events)
-
-    def service_definition(self, type_name: str, encoding: Encoding) -> str | None:
-        """The type of a service, as `KnowsServiceTypes` has it."""
-        return self.services.definition(type_name, encoding)
+        self.own_services.watch(events)
 
     async def call(self, name: TopicName, request: bytes, *, timeout_s: float) -> bytes:
-        return await self.services.call(name, request, timeout_s=timeout_s)
+        return await self.own_services.call(name, request, timeout_s=timeout_s)
 
-    def serve(self, info: ServiceInfo, handler: ServiceHandler) -> ServiceServer:
-        return self.services.serve(info, handler)
+    def serve(self, info: ServiceInfo, handler: ServiceHandler) -> Served:
+        return self.far_services.serve(info, handler)
 
-    # Connections
+    def service_definition(self, type_name: str, encoding: Encoding) -> str | None:
+        return self.types.service_definition(type_name, encoding)
+
+    # --- scenes -----------------------------------------------------------------------------------------------------
 
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if len(self.scenes) >= self.options.max_connections:
-            self.refused += 1
-            self._say(f"more than {self.options.max_connections} scenes; others are refused (max_connections)")
-            writer.transport.abort()
+        if self._stopping or len(self._connections) >= 2 * self.options.max_connections:
+            writer.transport.abort()  # not even those that are sent away are any number
             return
-        scene = Scene(reader, writer, self.options, self, self._fault)
+        outbox = Outbox(self.options.queue_bytes, self._drops)
+        scene = Scene(reader, writer, self, outbox, self.faults, self._limits)
         task = asyncio.current_task()
         assert task is not None
-        self.scenes[scene] = task
-        _log.info("a scene is connected from %s", scene.address)
-        why = Ended.STOPPED
+        self._connections[task] = scene
+        task.add_done_callback(self._connections.pop)
+        if len(self.scenes) >= self.options.max_connections:
+            await self._send_away(scene)
+            return
+        self.scenes.add(scene)
+        _log.info("the scene %s is connected", scene.peer)
         try:
-            why = await scene.run()
+            await scene.run(self._encoding)
         finally:
-            del self.scenes[scene]
-            self.ended[why] += 1
-            self._lost.update(scene.waiting.dropped)
+            self.scenes.discard(scene)
             self._gone(scene)
-            _log.info("the scene at %s has gone: %s", scene.address, why)
+            _log.info("the scene %s has gone", scene.peer)
+
+    async def _send_away(self, scene: Scene) -> None:
+        text = f"{self.options.max_connections} scenes are connected already (max_connections)"
+        self.faults(Fault.TOO_MANY, f"{text}; another one is sent away", scene)
+        await scene.refuse(self._encoding, GOODBYE_S)
 
     def _gone(self, scene: Scene) -> None:
-        self._next.pop(scene, None)
-        self.services.gone(scene)
-        if self._topics is not None and self._published is not None:
-            self._topics.gone(scene)
-            self._published.end_all(scene)
+        self.incoming.gone(scene)
+        self.publications.gone(scene)
+        self.far_services.gone(scene)
+        self.own_services.gone(scene)
 
-    def _fault(self, problem: str) -> None:
-        self.faults += 1
-        self._say(f"a Unity scene: {problem}")
+    # --- SceneHandler -----------------------------------------------------------------------------------------------
 
-    def frame(self, scene: Scene, frame: Frame) -> None:
-        """What a scene says. WireError: the connection cannot be gone on with."""
-        coming = self._next.pop(scene, None)
-        if frame.destination.startswith(framing.COMMAND):
-            try:
-                asked = Command(frame.destination)
-            except ValueError:
-                scene.error(f"{frame.destination[:80]!r} is no command that is known here")
-                return
-            self._asked(scene, asked, framing.parameters_of(frame.body))
-            return
-        try:
-            name = _named(frame.destination)
-        except ConfigError as error:
-            scene.error(str(error))
-            return
-        assert self._published is not None
-        if coming is None:
-            if not self._published.publish(scene, name, frame.body):
-                scene.error(f"{name}: a message without __publish before it; it is dropped")
-        elif coming[0] is Command.REQUEST:
-            self.services.asked(scene, coming[1], name, frame.destination, frame.body)
-        elif not self.services.answered(scene, coming[1], frame.body):
-            self._fault(f"{scene.address}: an answer to call {coming[1]} of {name}, for which nobody waits")
+    def command(self, scene: Scene, command: Command) -> None:
+        match command.kind:
+            case commands.SUBSCRIBE:
+                self.incoming.subscribe(scene, command)
+            case commands.REMOVE_SUBSCRIBER:
+                self.incoming.unsubscribe(scene, command.topic)
+            case commands.PUBLISH:
+                self.publications.publish(scene, command)
+            case commands.REMOVE_PUBLISHER:
+                self.publications.remove(scene, command.topic)
+            case commands.ROS_SERVICE:
+                self.far_services.register(scene, command)
+            case commands.REMOVE_ROS_SERVICE:
+                self.far_services.remove(scene, command.topic)
+            case commands.UNITY_SERVICE:
+                self.own_services.offer(scene, command)
+            case commands.REMOVE_UNITY_SERVICE:
+                self.own_services.remove(scene, command.topic)
+            case commands.REQUEST:
+                self.far_services.asks(scene, command.srv_id)
+            case commands.RESPONSE:
+                self.own_services.answers(scene, command.srv_id)
+            case commands.TOPIC_LIST:
+                self._list(scene)
 
-    def _asked(self, scene: Scene, asked: Command, said: Any) -> None:
-        if asked in (Command.REQUEST, Command.RESPONSE):
-            self._next[scene] = asked, framing.number_of(said, "srv_id")
-            return
-        assert self._topics is not None
-        if asked is Command.TOPIC_LIST:
-            known = self._topics.known()
-            types = [ros_types.ros1_name(type_name) for type_name in known.values()]
-            scene.answer(framing.command("topic_list", topics=list(known), types=types))
-            return
-        spelled = framing.text_of(said, "topic")
-        try:
-            self._of_a_name(scene, asked, said, _named(spelled), spelled)
-        except ConfigError as error:
-            scene.error(str(error))
+    def message(self, scene: Scene, spelling: str, body: bytes) -> None:
+        """A topic and a service may have one name: what was announced comes first."""
+        if self.far_services.expects(scene, spelling):
+            self.far_services.request(scene, spelling, body)
+        elif self.own_services.expects(scene, spelling):
+            self.own_services.response(scene, spelling, body)
+        elif self.publications.publishes(scene, spelling):
+            self.publications.message(scene, spelling, body)
+        elif self.own_services.serves(scene, spelling):
+            self.own_services.response(scene, spelling, body)
+        elif self.far_services.expects(scene):
+            self.far_services.request(scene, spelling, body)
+        else:
+            self._drops[DropReason.FORBIDDEN] += 1
+            text = f"messages of {shown(spelling)} are dropped: the scene has not registered it, or may not publish it"
+            self.faults(Fault.NOT_REGISTERED, text, scene)
 
-    def _of_a_name(self, scene: Scene, asked: Command, said: Any, name: TopicName, spelled: str) -> None:
-        """A command about a topic or a service. ConfigError: it cannot be done."""
-        assert self._topics is not None and self._published is not None
-        match asked:
-            case Command.SUBSCRIBE:
-                self._topics.subscribe(scene, name, spelled, _type(said, "msg"))
-            case Command.REMOVE_SUBSCRIBER:
-                self._topics.unsubscribe(scene, name)
-            case Command.PUBLISH:
-                self._publishes(scene, name, _type(said, "msg"), latched=said.get("latch") is True)
-            case Command.REMOVE_PUBLISHER:
-                self._published.end(scene, name)
-            case Command.USE_SERVICE:
-                self.services.uses(scene, name, _type(said, "srv"))
-            case Command.OFFER_SERVICE:
-                self.services.offers(scene, name, spelled, _type(said, "srv"))
-            case Command.REMOVE_OFFERED_SERVICE:
-                self.services.withdrawn(scene, name)
-            case Command.REMOVE_USED_SERVICE:
-                pass  # nothing is kept of who may call
+    def too_large(self, scene: Scene, spelling: str, nbytes: int) -> None:
+        self._drops[DropReason.TOO_LARGE] += 1
+        limit = f"max_message_bytes is {self.options.max_message_bytes}"
+        self.faults(Fault.TOO_LARGE, f"{shown(spelling)}: a message above {limit} is dropped", scene)
+        _log.debug("%s: %s has %d bytes", scene.peer, shown(spelling), nbytes)
 
-    def _publishes(self, scene: Scene, name: TopicName, type_name: str, *, latched: bool) -> None:
-        assert self._published is not None
-        kind = ros_types.resolve(type_name, self._definition(type_name), self.options.encoding)
-        info = TopicInfo(
-            name, kind.name, kind.encoding, kind.text.type_hash, kind.text.definition, latched=latched, reliable=latched
-        )
-        self._published.begin(scene, info)
-
-    def _definition(self, type_name: str) -> str:
-        """Of a type that is not known to everybody; empty: it is, or to nobody."""
-        if ros_types.describe(type_name, self.options.encoding) is not None:
-            return ""
-        return self.services.message_definition(type_name)
-
-
-def _named(text: str) -> TopicName:
-    """A name as scenes write it, with a slash before it or without. ConfigError: it is none."""
-    try:
-        return topic_name(text if text.startswith(_SLASH) else _SLASH + text)
-    except UsageError as error:
-        raise ConfigError(str(error)) from None
-
-
-def _type(said: Any, kind: str) -> str:
-    return type_of(framing.text_of(said, "message_name"), kind)
+    def _list(self, scene: Scene) -> None:
+        there = dict(self.publications) | dict(self.incoming)
+        topics = sorted(there)
+        scene.outbox.answer_list(commands.topic_list(topics, [names.their_type(there[topic]) for topic in topics]))
+        scene.wake()

@@ -1,26 +1,27 @@
-"""The options of the endpoint."""
+"""What a unity endpoint is told by its file; `sern_runtime/config/unity.py` says what each means."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from sern_core.vocabulary.types import Encoding
-
 
 @dataclass(frozen=True, slots=True)
 class UnityOptions:
-    """Each as the key of its name in the configuration file."""
+    """With `second` nothing is listened on: another process of the same client has the port."""
 
     listen: str = "127.0.0.1:10000"
-    allow_remote: bool = False
     protocol: Literal["ros1", "ros2"] = "ros2"
-    publish: bool | tuple[str, ...] = False
-    type_paths: tuple[Path, ...] = ()
-    max_connections: int = 8
+    allow_remote: bool = False
+    publish: tuple[str, ...] = ()
+    max_connections: int = 10
     max_message_bytes: int = 64 * 2**20
-    max_waiting_bytes: int = 8 * 2**20
+    queue_bytes: int = 64 * 2**20
     stalled_s: float = 10.0
+    type_paths: tuple[Path, ...] = ()
+    second: bool = False
 
     @property
-    def encoding(self) -> Encoding:
-        return Encoding.CDR if self.protocol == "ros2" else Encoding.ROS1
+    def place(self) -> tuple[str, int]:
+        """Host, without the brackets of IPv6, and port."""
+        host, _, port = self.listen.rpartition(":")
+        return host.strip("[]"), int(port)
