@@ -144,6 +144,8 @@ class ObjectExchange:
             change = decode(message.body)
             if isinstance(change, (Put, Set, Delete)):
                 object_id = change.object_id
+            elif isinstance(change, Define):  # it came packed
+                link.reassembly.work_us += len(change.text) // BYTES_PER_US
             self._apply(self._owners.setdefault(client, _Owner()), client, change, now)
         except (RefusedError, WireError) as error:
             code = error.code if isinstance(error, RefusedError) else "bad_object"

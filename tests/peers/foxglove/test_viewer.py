@@ -122,6 +122,9 @@ async def test_it_looks_publishes_and_calls() -> None:
         assert (await peer.of("answer", call=5))["body"] == "0201"
 
         peer.order("advertise", topic="/own", type="own_msgs/Thing")
+        await until(lambda: len(peer.found("advertised")) == 2)
+        assert not peer.found("status", id="sern/publish/own"), "viewers announce what nobody uses yet"
+        peer.order("publish", channel=peer.found("advertised")[1]["channel"], body=b"{}".hex())
         told = await peer.of("status", id="sern/publish/own")
         assert told["level"] == 2 and "is unknown here" in told["text"]
         assert not peer.found("error")
