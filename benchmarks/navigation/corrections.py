@@ -60,9 +60,7 @@ def corrections(seeds: int, report: Report) -> None:
             report.row(CASE, what, counted_things=len(ordered), median_s=percentile(ordered, 0.5),
                        p95_s=percentile(ordered, 0.95), most_s=ordered[-1])  # fmt: skip
             report.reach(f"{what} after it was first seen, p95, s", percentile(ordered, 0.95), 1.0)
-    report.row(
-        CASE, "told, and not so", flags_hour=flags / hours, driven_hours=hours, counted_real_cells_cleared=cleared
-    )
+    report.row(CASE, "told, and not so", flags_hour=flags / hours, driven_hours=hours, counted_cleared=cleared)
     report.reach("discrepancies that are none, an hour", flags / hours, 1.0)
 
 

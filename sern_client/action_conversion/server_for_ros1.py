@@ -210,18 +210,22 @@ class ServerForRos1:
             self._give_up(goal, Ros1Status.ABORTED, "it failed at its client's site")
 
     async def _give(self, goal: _Goal, request: bytes) -> bool:
-        """Whether it is accepted."""
+        """Whether it is accepted. One that is under way was, also where the answer that says so did not come."""
+        lost: str | None = None
         try:
             goal.accepted = bodies.is_accepted(await self._call("send_goal", request))
         except (ServiceError, ConfigError) as error:
-            self._give_up(goal, Ros1Status.REJECTED, str(error))
-            return False
-        if not goal.accepted:
+            lost = str(error)
+        goal.accepted = goal.accepted or goal.status is not Ros1Status.PENDING
+        if goal.accepted:
+            if goal.cancelled:
+                self._cancel(goal)
+        elif lost is not None:
+            self._give_up(goal, Ros1Status.REJECTED, lost)
+        else:
             why = "its server does not accept it, or did not answer in time"
             _log.warning("%s: goal %s is rejected: %s", self._name, goal.ident.shown, why)
             self._end(goal, Ros1Status.REJECTED, f"SERN: {why}")
-        elif goal.cancelled:
-            self._cancel(goal)
         return goal.accepted
 
     async def _wait(self, goal: _Goal) -> None:

@@ -5,11 +5,11 @@ the topic itself come.
 """
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import nan
 from typing import Final
 
-from sern_client.endpoints.base import Viewed
+from sern_client.endpoints.base import TopicNews
 from sern_core.vocabulary.errors import UsageError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.names import topic_name
@@ -18,6 +18,7 @@ from sern_runtime import clock, ros_types
 from sern_runtime.loop import Timer
 
 SUFFIX: Final = "/sern/age"
+TYPE: Final = "std_msgs/msg/Float32"
 PERIOD_S: Final = 0.25
 _CDR_HEAD: Final = b"\x00\x01\x00\x00"
 _FLOAT: Final = struct.Struct("<f")
@@ -33,7 +34,7 @@ def age_topic(info: TopicInfo) -> TopicInfo | None:
     except UsageError:
         return None
     encoding = Encoding.ROS1 if info.encoding is Encoding.ROS1 else Encoding.CDR
-    return ros_types.topic_info(name, "std_msgs/msg/Float32", encoding)
+    return ros_types.topic_info(name, TYPE, encoding)
 
 
 def age_body(age_s: float, encoding: Encoding) -> bytes:
@@ -42,29 +43,38 @@ def age_body(age_s: float, encoding: Encoding) -> bytes:
 
 
 class Ages:
-    """Has `publish(name, age_s)` called of each topic whose age somebody looks at; NaN: nothing of it has come."""
+    """Has `publish(name, age_s)` called of each topic whose age somebody looks at; NaN: nothing of it has come.
+    `topics` says how old they are. Of one that has gone the last message goes on growing older."""
 
-    def __init__(self, viewed: Viewed, publish: Callable[[TopicName, float], None]) -> None:
-        self._viewed = viewed
+    def __init__(self, topics: Callable[[], Sequence[TopicNews]], publish: Callable[[TopicName, float], None]) -> None:
+        self._topics = topics
         self._publish = publish
         self._looked_at: set[TopicName] = set()
+        self._born_s: dict[TopicName, float] = {}  # of their newest messages
         self._timer = Timer(self._tell)
 
     def look(self, name: TopicName, looked: bool) -> None:
         """Somebody looks at the age of a topic, by the topic's name, or nobody does any more."""
-        (self._looked_at.add if looked else self._looked_at.discard)(name)
+        if looked:
+            self._looked_at.add(name)
+        else:
+            self._looked_at.discard(name)
+            self._born_s.pop(name, None)
         if self._looked_at and self._timer.deadline_s is None:
             self._timer.arm(clock.now())
 
     def close(self) -> None:
         self._looked_at.clear()
+        self._born_s.clear()
         self._timer.cancel()
 
     def _tell(self) -> None:
         if not self._looked_at:
             return
-        self._timer.arm(clock.now() + PERIOD_S)
-        known = {news.name: news.age_s for news in self._viewed.topics()}
+        now = clock.now()
+        self._timer.arm(now + PERIOD_S)
+        for news in self._topics():
+            if news.name in self._looked_at and news.age_s is not None:
+                self._born_s[news.name] = now - news.age_s
         for name in list(self._looked_at):
-            age_s = known.get(name)
-            self._publish(name, nan if age_s is None else age_s)
+            self._publish(name, now - self._born_s[name] if name in self._born_s else nan)

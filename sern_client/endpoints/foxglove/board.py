@@ -134,7 +134,7 @@ class Board:
         self._open_channel = open_channel
         self._topics: dict[TopicName, _Shown] = {}
         self._by_number: dict[int, _Shown] = {}
-        self._ages = Ages(viewed, self._show_age)
+        self._ages = Ages(viewed.topics, self._show_age)
         self._closed = False
 
     @property

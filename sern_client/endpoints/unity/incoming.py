@@ -11,12 +11,13 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from sern_client.endpoints.base import Viewed
+from sern_client.endpoints.common.ages import SUFFIX as AGE_SUFFIX
+from sern_client.endpoints.common.ages import TYPE as AGE_TYPE
 from sern_client.endpoints.unity import names
-from sern_client.endpoints.unity.ages import AGE_TYPE, Ages, AgeWatch
+from sern_client.endpoints.unity.ages import AgeWatch, AgeWatches
 from sern_client.endpoints.unity.commands import Command, shown
 from sern_client.endpoints.unity.faults import Fault, Faults
 from sern_client.endpoints.unity.frames import frame
-from sern_client.endpoints.unity.names import AGE_SUFFIX
 from sern_client.endpoints.unity.outbox import ALL, NEWEST, SOME, Keep
 from sern_client.endpoints.unity.scene import Scene
 from sern_client.tf_latch import TF_TYPE, TfLatch, is_static_tf
@@ -118,7 +119,7 @@ class Incoming:
         self._knows = knows
         self._topics: dict[TopicName, _Topic] = {}
         self._of_scenes: dict[Scene, dict[str, _Subscribed]] = {}
-        self._ages = Ages(encoding, lambda: () if self.viewed is None else self.viewed.topics())
+        self._ages = AgeWatches(encoding, lambda: () if self.viewed is None else self.viewed.topics())
 
     # --- what other sites have --------------------------------------------------------------------------------------
 

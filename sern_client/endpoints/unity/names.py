@@ -1,14 +1,9 @@
 """How topics and types are called in a scene and here."""
 
-from typing import Final
-
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.names import topic_name
 from sern_core.vocabulary.types import TopicName
 from sern_runtime import ros_types
-
-AGE_SUFFIX: Final = "/sern/age"
-"""Behind the name of a topic: how old its newest message is."""
 
 
 def local_name(spelling: str) -> TopicName:

@@ -270,6 +270,28 @@ async def test_a_goal_that_nobody_answers(
     assert (await robot.call("cancel_goal")).uuid == call.uuid
 
 
+@pytest.mark.parametrize("lost", [ServiceError("no link"), None])
+async def test_a_goal_that_is_under_way_was_accepted_whatever_becomes_of_the_answer(
+    site: Site, robot: Robot, tmp_path: Path, lost: ServiceError | None
+) -> None:
+    """Its status overtakes the answer, which the link then loses, or which was not in time."""
+    client_appears(site, tmp_path)
+    give(site)
+    call = await robot.call("send_goal")
+    robot.says((call.uuid, Ros2Status.EXECUTING))
+    cancel(site, IDENT)
+    if lost is not None:
+        call.answer.set_exception(lost)
+    else:
+        answer = refusal(ServiceInfo(TopicName("/a/_action/send_goal"), "", Encoding.CDR, ""))
+        assert answer is not None
+        call.answer.set_result(answer)
+    (await robot.call("get_result")).answer.set_result(response(Ros2Status.CANCELED, 3))
+    assert (await robot.call("cancel_goal")).uuid == call.uuid
+    await until(lambda: results(site), "its result is told")
+    assert results(site) == [StatusPart(IDENT, Ros1Status.PREEMPTED, "", struct.pack("<Ii", 1, 3))]
+
+
 @pytest.mark.parametrize("answer", [response(Ros2Status.UNKNOWN), b"\1", response(77), ServiceError("no link")])
 async def test_a_result_that_nobody_knows(
     site: Site, robot: Robot, tmp_path: Path, answer: bytes | ServiceError, caplog: pytest.LogCaptureFixture
