@@ -123,10 +123,10 @@ class _Nobody:
     """`TopicEvents` of nobody."""
 
     def topic_added(self, info: TopicInfo) -> None:
-        """Nobody publishes."""
+        """Nobody publishes here."""
 
     def topic_removed(self, name: TopicName) -> None:
-        """So nothing goes."""
+        """Nothing that was never published goes."""
 
 
 def _serve(system: str, orders: Connection, duration_s: float) -> None:

@@ -7,7 +7,7 @@ from sern_core.vocabulary.types import TopicName
 
 
 class Subscribed:
-    """`tell(patterns)` replaces what the relay was told. Nothing is told before `begin`."""
+    """`tell(patterns)` replaces what the relay was told."""
 
     def __init__(self, tell: Callable[[tuple[str, ...]], None]) -> None:
         self._own = PatternSet(())

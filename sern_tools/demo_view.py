@@ -33,7 +33,7 @@ SAID_S: Final = 5.0
 """How often it is said what comes to the site."""
 VIEWS: Final = ("foxglove",)
 _PORT: Final = 8765
-"""Where viewers look by themselves; if somebody has it, another."""
+"""The port that viewers look at by themselves; where somebody has it, another is taken."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ def contents(options: ViewOptions, relay_port: int, view_port: int, web: Mapping
 
 
 async def look(options: ViewOptions, console: Console) -> None:
-    """Until Ctrl-C, which is asyncio.CancelledError. SernError: it could not run."""
+    """Run it until Ctrl-C, which is asyncio.CancelledError. SernError: it could not run."""
     if options.view not in VIEWS:
         raise ConfigError(f"--view {options.view}: there is a view for {', '.join(VIEWS)}")
     cancelled_by_signals()

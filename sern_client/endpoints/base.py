@@ -307,7 +307,7 @@ class Viewed(Protocol):
         subscribed to over the link, and comes through `advertise` as every other topic."""
 
     def topics(self) -> Sequence[TopicNews]:
-        """Of the topics that come here now."""
+        """News of the topics that come here now."""
         ...
 
 
@@ -316,7 +316,7 @@ class ViewingEndpoint(Protocol):
     """An endpoint at which people look at some of what there is, and nothing else need come."""
 
     def use_viewed(self, viewed: Viewed) -> None:
-        """Once, before `start`."""
+        """The client gives this once, before `start`."""
 
     def topic_offered(self, info: TopicInfo) -> None:
         """Another site has this topic, local name in `info`; again when it is described otherwise."""

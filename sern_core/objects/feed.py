@@ -47,7 +47,8 @@ OVERHEAD_BYTES: Final = 40
 Sees = Callable[[str, ObjectKind | None], bool]
 """Whether the reader wants an object, and may have it. None: the kind of one that is gone is not known."""
 WantsValue = Callable[[str, ObjectKind], bool]
-"""Whether the reader wants an object's value, too."""
+"""Whether the reader wants an object's value, too. None in its place: it wants no value at all, and what has another
+value alone is not even looked at."""
 
 
 def _always(_object_id: str, _kind: ObjectKind) -> bool:
@@ -77,7 +78,7 @@ class ObjectFeed:
         text_of: Callable[[XrObject], str],
         now: float,
         kinds: Collection[ObjectKind] | None = None,
-        wants_value: WantsValue = _always,
+        wants_value: WantsValue | None = _always,
         first: int = 1,
     ) -> None:
         self._registry = registry
@@ -85,8 +86,6 @@ class ObjectFeed:
         self.sees = sees
         self.kinds = kinds
         self.wants_value = wants_value
-        self.bare = False
-        """The reader wants no value at all: what has another value alone is not even looked at."""
         self._text_of = text_of
         self.channel = link.outgoing.open(object_stream(link.end.name, link.end.boot), first=first, now=now)
         self.untold = 0
@@ -161,7 +160,7 @@ class ObjectFeed:
 
     def _poll(self, now: float) -> None:
         registry = self._registry
-        newest = registry.described_version if self.bare else registry.version
+        newest = registry.described_version if self.wants_value is None else registry.version
         if self._pending or self._open or self._version >= newest:
             return
         if now >= self._looked_s + REST_S:
@@ -187,7 +186,7 @@ class ObjectFeed:
                 self._say(encode(Delete(object_id, upto)), now)
                 self._open = bool(self._pending)
             return
-        valued = self.wants_value(object_id, about[0])
+        valued = self.wants_value is not None and self.wants_value(object_id, about[0])
         item = self._registry.get(object_id, valued=valued)
         if item is None or (known is not None and known.version == item.version):
             return

@@ -280,7 +280,6 @@ class ObjectExchange:
                 sees=lambda object_id, kind: self._sees(client, object_id, kind),
                 text_of=self._text_of,
                 kinds=told,
-                wants_value=lambda object_id, kind: self._wants_value(client, object_id, kind),
                 first=self._first,
                 now=now,
             )
@@ -288,7 +287,7 @@ class ObjectExchange:
         else:
             feed.kinds, feed.idle = told, False
             feed.restart()
-        feed.bare = not any(want.valued for want in wants)
+        feed.wants_value = partial(self._wants_value, client) if any(want.valued for want in wants) else None
         feed.pump(now=now)
 
     def _sees(self, client: ClientName, object_id: str, kind: ObjectKind | None) -> bool:

@@ -29,7 +29,7 @@ RENEWED_S: Final = 5.0
 """How long viewers have to find a channel that was described anew, before nobody looks at its topic any more."""
 MAX_KEPT: Final = 1_000
 MAX_KEPT_BYTES: Final = 32 * 2**20
-"""Of one latched topic and publisher: the newest are kept; one message always is."""
+"""What is kept of one latched topic and publisher: the newest, and one message always."""
 
 _log = logging.getLogger(__name__)
 

@@ -70,7 +70,7 @@ class FoxgloveEndpoint:
 
     @property
     def port(self) -> int:
-        """Where viewers connect, also when port 0 was asked for. Only while started."""
+        """The port that viewers connect to, also when port 0 was asked for. Only while started."""
         return self._door.port
 
     @property

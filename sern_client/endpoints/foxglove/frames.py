@@ -11,9 +11,9 @@ from enum import StrEnum
 from typing import Any, Final, NamedTuple
 
 MAX_TEXT_BYTES: Final = 1 << 20
-"""Of what a viewer says in JSON: a list of 20,000 subscriptions."""
+"""The longest thing that a viewer may say in JSON: a list of 20,000 subscriptions."""
 MAX_BINARY_BYTES: Final = 16 << 20
-"""Of a message that a viewer publishes, and of the request of a call."""
+"""The longest message that a viewer may publish, and the longest request of a call."""
 MESSAGE_DATA: Final = 1
 CALL: Final = 2
 PLAYBACK: Final = 3

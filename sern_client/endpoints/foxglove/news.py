@@ -169,7 +169,7 @@ def _status(status: str, level: int, text: str) -> dict[str, object]:
 
 
 def _lost(dropped: Mapping[DropReason, int]) -> dict[DropReason, int]:
-    """Without what came twice: it is counted, and nothing is missing."""
+    """What is missing: a message that came twice is counted as dropped, and is there."""
     return {reason: count for reason, count in dropped.items() if reason != DropReason.DUPLICATE}
 
 

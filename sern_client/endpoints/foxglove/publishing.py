@@ -28,7 +28,7 @@ ENCODINGS: Final = (JSON, "cdr", "ros1")
 """What viewers may publish in. They take the first that they can write, and JSON is the one for which they need to know
 nothing of a type."""
 MAX_TOPICS: Final = 200
-"""Of all viewers."""
+"""Topics that all viewers together may publish."""
 _STATUS: Final = "sern/publish"
 
 _log = logging.getLogger(__name__)

@@ -54,7 +54,7 @@ class Server:
 
     def __init__(self) -> None:
         self.address = ("", 0)
-        """Where it listens. Nobody but the door is told."""
+        """The place that it listens at, which only the door is told."""
         self._server: websocket.WebSocketServer | None = None
         self._context: foxglove.Context | None = None
         self._handover: Handover | None = None

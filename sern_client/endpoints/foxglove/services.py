@@ -64,7 +64,7 @@ class Served:
         self._closed = False
 
     def answer(self, request: "foxglove.ServiceRequest") -> bytes:
-        """In a thread of the SDK. What it raises is what the viewer is told."""
+        """Called in a thread of the SDK. What it raises is what the viewer is told."""
         if request.encoding != self._encoding:
             raise ServiceError(f"{self.name} takes requests in {self._encoding}, not in {request.encoding[:40]}")
         call = asyncio.run_coroutine_threadsafe(self._call(request.payload), self._loop)

@@ -56,7 +56,8 @@ class Owner(Protocol):
 
 
 class Viewer:
-    """From its admission to its end. `transport`: its own. `protocol`: what it calls the one that is spoken."""
+    """One viewer, from its admission to its end. `transport`: its own. `protocol`: its name for the one that is
+    spoken."""
 
     def __init__(
         self, peer: str, transport: asyncio.Transport, owner: Owner, *, protocol: str, max_waiting_bytes: int

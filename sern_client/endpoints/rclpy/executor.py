@@ -42,7 +42,7 @@ class Executor(SingleThreadedExecutor):
             self._idle.set()
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
-        """From any other thread than the one that spins."""
+        """Called from any other thread than the one that spins."""
         with self._lock:
             self._left = True
         if not self._idle.is_set():
@@ -52,5 +52,5 @@ class Executor(SingleThreadedExecutor):
         return bool(super().shutdown(timeout_sec))
 
     def _leave(self) -> None:
-        """In the thread that spins, where shutting down is safe."""
+        """Called in the thread that spins, where shutting down is safe."""
         super().shutdown(0)

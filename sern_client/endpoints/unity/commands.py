@@ -9,7 +9,7 @@ from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.types import Encoding
 
 VERSION: Final = "v0.7.0"
-"""Of the protocol. Unity takes what begins with `v0.7.`."""
+"""The version of the protocol. Unity takes what begins with `v0.7.`."""
 MAX_SRV_ID: Final = 2**31 - 1
 """Numbers of calls are signed in Unity."""
 

@@ -26,7 +26,7 @@ from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 
 MAX_SUBSCRIPTIONS: Final = 4000
-"""Of one scene."""
+"""Subscriptions that one scene may have."""
 
 _log = logging.getLogger(__name__)
 
@@ -96,7 +96,7 @@ class _Topic:
 
     @property
     def type_name(self) -> str | None:
-        """Of what there is now; None: it is not there."""
+        """The type of what there is now; None: it is not there."""
         if self.streams:
             return self.streams[0].info.type_name
         return None if self.offered is None else self.offered.type_name

@@ -7,7 +7,7 @@ from typing import Literal
 
 @dataclass(frozen=True, slots=True)
 class UnityOptions:
-    """With `second` nothing is listened on: another process of the same client has the port."""
+    """The options of the endpoint. With `second` it listens nowhere: another process of the client has the port."""
 
     listen: str = "127.0.0.1:10000"
     protocol: Literal["ros1", "ros2"] = "ros2"

@@ -30,7 +30,7 @@ class Keep(NamedTuple):
 NEWEST: Final = Keep(1, DropReason.SUPERSEDED)
 SOME: Final = Keep(100, DropReason.SUPERSEDED)
 ALL: Final = Keep(inf, DropReason.QUEUE_FULL)
-"""As many as fit into what may wait for the scene."""
+"""Every message is kept that fits into what may wait for the scene."""
 
 
 class Outbox:
@@ -38,7 +38,7 @@ class Outbox:
 
     def __init__(self, max_bytes: int, drops: Counter[DropReason]) -> None:
         self.nbytes = 0
-        """Of messages of streams and services; ITEM_BYTES more for each than it has."""
+        """Bytes of messages of streams and services; each counts as ITEM_BYTES more than it has."""
         self._max_bytes = max_bytes
         self._drops = drops
         self._said: BoundedQueue[bytes] = BoundedQueue(max_bytes=MAX_SAID_BYTES)

@@ -22,7 +22,7 @@ from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import DropReason, TopicName
 
 MAX_PUBLICATIONS: Final = 1000
-"""Of one scene."""
+"""Topics that one scene may publish."""
 
 _log = logging.getLogger(__name__)
 

@@ -22,7 +22,7 @@ from sern_core.vocabulary.types import DropReason, Encoding
 from sern_runtime import clock
 
 KEEP_ALIVE_S: Final = 0.8
-"""After so long without anything else a scene gets a keep-alive."""
+"""A scene gets a keep-alive after so long without anything else."""
 READ_BYTES: Final = 64 * 1024
 WRITE_BYTES: Final = 64 * 1024
 """A piece of a message that is handed to the kernel at once. What is there cannot be overtaken."""
@@ -44,7 +44,7 @@ class SceneHandler(Protocol):
     def command(self, scene: "Scene", command: Command) -> None: ...
 
     def message(self, scene: "Scene", spelling: str, body: bytes) -> None:
-        """For a topic or service as the scene spells it."""
+        """A message for a topic or service, as the scene spells it."""
 
     def too_large(self, scene: "Scene", spelling: str, nbytes: int) -> None: ...
 
