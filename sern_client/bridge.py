@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from sern_client.actions import GoalWatch
+from sern_client.durable import DurableTopics
 from sern_client.endpoints.common.saying import SayOnce
 from sern_client.guard import Guard
 from sern_client.inbound import Inbound
@@ -40,7 +41,8 @@ class Shell(Protocol):
 class Bridge:
     """`ClientEvents` of the core that `make_core` makes. `outbound` is told by the endpoint which topics there are.
 
-    `make_services` is given where there are rules for services, `goals` where there are rules for actions of ROS 1.
+    `make_services` is given where there are rules for services, `goals` where there are rules for actions of ROS 1,
+    `make_durable` where there is a place for durable topics.
     """
 
     def __init__(
@@ -53,12 +55,14 @@ class Bridge:
         make_services: Callable[[ClientCore], ServiceBridge] | None = None,
         guard: Guard | None = None,
         goals: GoalWatch | None = None,
+        make_durable: Callable[[ClientCore], DurableTopics] | None = None,
         withdraws: bool = False,
     ) -> None:
         self._shell = shell
         self.site = site
         self.core = make_core(self)
-        self.outbound = Outbound(site, self.core, discovery, goals=goals)
+        self.durable = None if make_durable is None else make_durable(self.core)
+        self.outbound = Outbound(site, self.core, discovery, goals=goals, durable=self.durable)
         self.inbound = Inbound(site, self.core, guard=guard, goals=goals, withdraws=withdraws)
         self.goals = goals
         self.services = None if make_services is None else make_services(self.core)
@@ -72,6 +76,8 @@ class Bridge:
         if self.goals is not None:
             self.goals.close()
         self.inbound.close()
+        if self.durable is not None:
+            self.durable.close()
 
     # --- ClientEvents: of the link ----------------------------------------------------------------------------------
 

@@ -12,6 +12,7 @@ from sern_client.link_state import LinkState
 from sern_client.summaries.client_summaries import register_summaries
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.collector import CollectorWatch
+from sern_runtime.durable.durable_metrics import register_durable
 from sern_runtime.internal_errors import InternalErrors
 from sern_runtime.link_metrics import register_codecs, register_links, register_received
 from sern_runtime.metrics import Metrics
@@ -51,6 +52,7 @@ def _register_link(metrics: Metrics, parts: Counting) -> None:
     register_received(metrics, core.received, bridge.inbound.ages)
     register_codecs(metrics, core.coder)
     parts.link_state.register(metrics)
+    register_durable(metrics, bridge.durable)
     parts.errors.register(metrics)
     parts.collector.register(metrics)
     register_summaries(metrics, bridge.outbound.summaries)

@@ -7,6 +7,7 @@ import secrets
 import time
 from collections.abc import Callable
 from contextlib import AsyncExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -19,6 +20,7 @@ from sern_client.bridge import Bridge
 from sern_client.checks import TableCheck
 from sern_client.client_metrics import Counting, register_client
 from sern_client.connection import Connection
+from sern_client.durable import DurableTopics
 from sern_client.endpoints.base import (
     BothTold,
     Endpoint,
@@ -44,6 +46,7 @@ from sern_core.objects.feed import PERIOD_S
 from sern_core.site.client import ClientCore, ClientEvents
 from sern_core.topics.patterns import PatternSet, compile_pattern
 from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.message import TopicInfo, TopicSpec
 from sern_core.vocabulary.trace import DecisionTrace
 from sern_core.vocabulary.types import CLASS_LABELS, DropReason, ObjectKind
 from sern_core.wire import framing
@@ -131,6 +134,7 @@ class ClientDaemon:
             make_services=self._services(endpoint),
             guard=self.guard,
             goals=self._make_goals(),
+            make_durable=self._durable(),
             withdraws=state.withdraw_after_s is not None,
         )
         self.core = self.bridge.core
@@ -178,6 +182,19 @@ class ClientDaemon:
         if self.message_log is not None:
             core.link.end.fates = LoggedFates(self.message_log, self.parts)
         return core
+
+    def _durable(self) -> Callable[[ClientCore], DurableTopics] | None:
+        """What makes the keeper of durable topics; None: there is no place for them."""
+        section = self.loaded.model.durable
+        if section is None:
+            return None
+        directory, most = self.loaded.resolve(section.directory), section.max_bytes
+        return lambda core: DurableTopics(directory, max_bytes=most, core=core, now=clock.now)
+
+    def _rule_of(self, info: TopicInfo) -> TopicSpec:
+        """How a topic of this site is treated, by its global name."""
+        name = self.site.rules.inward(info.name, namespace=self.site.namespace)
+        return self.site.rules.resolve(replace(info, name=name), local_name=name).spec
 
     def _make_goals(self) -> GoalWatch | None:
         sections = self.loaded.model.actions.use
@@ -244,6 +261,9 @@ class ClientDaemon:
             with blamed_on(self.loaded.path, "http", "listen"):
                 self._http = self._make_http(model.http.listen)
                 await self._http.start()
+        if self.bridge.durable is not None:  # before the endpoint, whose topics go on where they were
+            with blamed_on(self.loaded.path, "durable", "directory"):
+                self.bridge.durable.start(asyncio.get_running_loop().call_soon_threadsafe, self._rule_of)
         # Before the transport: streams from the relay are advertised at the endpoint as soon as there is a session.
         events = self.bridge.outbound if self.scene is None else BothTold(self.bridge.outbound, self.scene)
         await self.site.endpoint.start(events)
@@ -302,6 +322,8 @@ class ClientDaemon:
             self.check.tick(now=clock.now())
             self.link_state.look()
             self.bridge.outbound.leaving.look(now=clock.now())
+            if self.bridge.durable is not None:
+                self.bridge.durable.look()
             if watchdog.interval_s is not None:
                 watchdog.check()
             self.news.look()

@@ -2,7 +2,8 @@
 
 A node that publishes a few messages and ends is usual (`rostopic pub -1`, `rosbag play`). The stream goes on until the
 relay has got them all, or for `LEAVE_S`: what has not arrived then is reported as ever. What subscribers behind the
-relay are still owed is the relay's to keep. The streams of one topic (a grid and its changes) end together.
+relay are still owed is the relay's to keep. The streams of one topic (a grid and its changes) end together. Of durable
+topics nothing is given up (`durable.py`).
 """
 
 from collections.abc import Callable
@@ -46,4 +47,5 @@ class Leaving:
 
 def _owes(channel: OutChannel) -> bool:
     """Whether something of it must still get to the relay."""
-    return channel.reliable and channel.wanted is not False and bool(channel.queue or channel.flying)
+    here = channel.reliable and not channel.spec.durable
+    return here and channel.wanted is not False and bool(channel.queue or channel.flying)

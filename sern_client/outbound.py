@@ -7,10 +7,12 @@ from dataclasses import replace
 from typing import Final
 
 from sern_client.actions import GoalWatch
+from sern_client.durable import DurableTopics
 from sern_client.endpoints.base import Difference, Sink, Subscription
 from sern_client.frames import Rewrite
 from sern_client.leaving import Leaving
 from sern_client.site import Site
+from sern_client.stored_topics import StoredTopics
 from sern_client.summaries.client_summaries import Summaries
 from sern_client.summaries.source import Source, streams_of
 from sern_client.summaries.topic_summary import Send
@@ -55,9 +57,18 @@ class Outgoing:
 
 class Outbound:
     """`TopicEvents` of the endpoint. The core's news of our own streams come to it as well. `goals`: those of ROS 1
-    that this site gives to others, where there are rules for them."""
+    that this site gives to others, where there are rules for them; `durable`: what keeps topics on disk, where there is
+    a place for them."""
 
-    def __init__(self, site: Site, core: ClientCore, discovery: Discovery, *, goals: GoalWatch | None = None) -> None:
+    def __init__(
+        self,
+        site: Site,
+        core: ClientCore,
+        discovery: Discovery,
+        *,
+        goals: GoalWatch | None = None,
+        durable: DurableTopics | None = None,
+    ) -> None:
         self.refusals = 0
         """Publications that the relay did not take."""
         self.reckoned = 0
@@ -68,6 +79,9 @@ class Outbound:
         self._core = core
         self._discovery = discovery
         self._goals = goals
+        self._durable = durable
+        self.stored = StoredTopics(site.advertise)
+        """What says of durable topics how much of them is on disk."""
         self._stopped = False
         self._closed = False
         self._topics: dict[TopicName, Outgoing] = {}
@@ -82,7 +96,8 @@ class Outbound:
     @property
     def pending(self) -> int:
         """Messages that something else is being made of, and that are not offered to the link yet."""
-        return sum(outgoing.source.pending for outgoing in self._topics.values() if outgoing.source is not None)
+        made = sum(outgoing.source.pending for outgoing in self._topics.values() if outgoing.source is not None)
+        return made + (0 if self._durable is None else self._durable.pending)
 
     def stop_sources(self) -> None:
         """Offer nothing more to the link. Idempotent."""
@@ -100,6 +115,7 @@ class Outbound:
                 for channel in outgoing.source.own:
                     self._unpublish(channel)
         self.summaries.close()
+        self.stored.close_all()
         self._topics.clear()
         self._by_stream.clear()
         self.leaving.close()
@@ -129,7 +145,10 @@ class Outbound:
         except UsageError as error:
             _log.error("%s cannot be offered as %s: %s", info.name, name, error)
             return
-        sink = self._sink(channel, self._site.frames.outgoing(info)) if source is None else source.sink
+        if self._durable is not None and resolved.spec.durable:
+            sink = self._kept(info, channel, self._durable)
+        else:
+            sink = self._sink(channel, self._site.frames.outgoing(info)) if source is None else source.sink
         if resolved.dead_reckoning and source is None and info.encoding is not Encoding.RAW:
             sink = self._reckoned(info, sink)
         if self._goals is not None:
@@ -152,6 +171,7 @@ class Outbound:
             if self._goals is not None:
                 self._goals.withdrawn(name)
             outgoing.subscription.close()
+            self.stored.close(name)
             self._forget_source(outgoing.source)
             self.leaving.leave(name, *streams_of(outgoing.channel, outgoing.source), now=clock.now())
             self._site.kick()
@@ -170,6 +190,8 @@ class Outbound:
             self._unpublish(each)
 
     def _unpublish(self, channel: OutChannel) -> None:
+        if self._durable is not None and self._durable.leave(channel):
+            return
         self._site.values.forget(channel.stream.id)
         self._core.unpublish(channel, now=clock.now())
 
@@ -192,6 +214,8 @@ class Outbound:
         if merge:
             # A message of all static transforms replaces the ones before; every other one counts.
             spec = replace(spec, max_rate_hz=None, depth=1 if static else spec.depth)
+        if self._durable is not None and spec.durable:
+            return self._durable.publish(replace(info, name=name), spec), None
         channel = core.publish(replace(info, name=name), spec, now=clock.now())
         if not merge:
             return channel, None
@@ -203,6 +227,12 @@ class Outbound:
     def _sink(self, channel: OutChannel, rewrite: Rewrite | None) -> Sink:
         send = self._send(channel, rewrite)
         return lambda body, stamp_ns: send(body, stamp_ns, None)
+
+    def _kept(self, info: TopicInfo, channel: OutChannel, durable: DurableTopics) -> Sink:
+        """What keeps messages, and sends them when they are on disk."""
+        rewrite = self._site.frames.outgoing(info)
+        keep = durable.sender(channel, self._send(channel, None, forced=True), self.stored.of(info))
+        return lambda body, stamp_ns: keep(body if rewrite is None else rewrite(body), stamp_ns, None)
 
     def _reckoned(self, info: TopicInfo, sink: Sink) -> Sink:
         from sern_client.reckoned import ReckonedPoses  # who does not ask for it need not load it
@@ -216,7 +246,9 @@ class Outbound:
         """What puts bodies of the type `info` into a channel; for topics of which something else is made."""
         return self._send(channel, self._site.frames.outgoing(info))
 
-    def _send(self, channel: OutChannel, rewrite: Rewrite | None) -> Callable[[bytes, int, float | None], bool]:
+    def _send(
+        self, channel: OutChannel, rewrite: Rewrite | None, *, forced: bool = False
+    ) -> Callable[[bytes, int, float | None], bool]:
         core, kick, log, stream, parts = self._core, self._site.kick, self._site.log, channel.stream, self._site.parts
         passed = self._site.values.passed
 
@@ -224,7 +256,7 @@ class Outbound:
             seq = channel.next_seq
             if rewrite is not None:
                 body = rewrite(body)
-            accepted = core.send(channel, body, stamp_ns, born_s=born_s, now=clock.now())
+            accepted = core.send(channel, body, stamp_ns, born_s=born_s, now=clock.now(), forced=forced)
             if accepted:
                 passed(stream, seq, body)
             if log is not None:

@@ -24,7 +24,7 @@ class Tables:
         show for a moment."""
         inbound, outbound = self._bridge.inbound, self._bridge.outbound
         found = inbound.validate() + outbound.validate()
-        publishers = inbound.held
+        publishers = inbound.held + outbound.stored.held
         if self._link_state is not None:
             publishers += self._link_state.held
         subscriptions = outbound.held
@@ -39,4 +39,5 @@ class Tables:
         if self._link_state is not None:
             self._link_state.repair(publishers)
         self._bridge.inbound.repair(publishers)
+        self._bridge.outbound.stored.repair(publishers)
         self._bridge.outbound.repair({each.name for each in differences if each.kind == "subscription"})

@@ -68,9 +68,16 @@ class StreamsIn:
 
     def begin(self, *, resumed: bool, now: float) -> None:
         """A session has begun."""
-        if self._end.initiator and not resumed:  # a new relay has yet to learn of them
+        if resumed:
+            return
+        if self._end.initiator:  # a new relay has yet to learn of them
             for identity in self.streams:
                 self._missing.setdefault(identity, now)
+        for stream in self.streams.values():
+            if (
+                stream.stream.spec.durable
+            ):  # another process goes on with it, and may encode what is half here otherwise
+                stream.forget(DropReason.DISCONNECTED)
 
     def leave(self) -> None:
         """The session is over: channels have no streams."""
@@ -179,9 +186,11 @@ class StreamsIn:
         self.go_on(now)
 
     def outlived(self, origin: ClientName, boot: int, *, now: float) -> None:
-        """A process of `origin` is there, `boot`: what a new relay has not been told of the ones before is gone."""
+        """A process of `origin` is there, `boot`: what a new relay has not been told of the ones before is gone, unless
+        the origin keeps it on disk."""
         for identity in [each for each in self._missing if each.origin == origin and each.boot != boot]:
-            self.retract(self.streams[identity], now)
+            if not self.streams[identity].stream.spec.durable:
+                self.retract(self.streams[identity], now)
 
     def retract(self, stream: InStream, now: float) -> None:
         """The peer no longer has the stream."""

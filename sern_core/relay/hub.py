@@ -313,7 +313,8 @@ class Hub:
     def on_announce(self, link: Link, announcement: Announcement, *, now: float) -> bool | None:
         stream = link.taking.streams[announcement.stream.id]
         identity = stream.stream.id
-        if identity.origin != link.peer or identity.boot != link.end.peer_boot:
+        # What is kept on disk has the number of its store, which is the origin's to draw.
+        if identity.origin != link.peer or (identity.boot != link.end.peer_boot and not stream.stream.spec.durable):
             raise RefusedError("origin", f"{link.peer} announced a stream of {identity.origin}")
         if identity.topic == OBJECTS_TOPIC:
             return True

@@ -16,7 +16,8 @@ Names
   Only when every owner declares it `many_writers` may several clients hold it (`/tf`).
 - A client lives in one boot at a time. Announcing under another boot replaces all that it had; boots are drawn at
   random, so "newer" means "announced later", and a boot that was replaced comes back only with a session (`returned`):
-  of two processes with one name each may.
+  of two processes with one name each may. Streams that their origin keeps on disk go on from one process to the next:
+  their number is the store's, and another one replaces the stream of that name alone.
 
 Who announces is the caller's business: `StreamInfo.id.origin` must be the name bound to the peer's key.
 """
@@ -221,17 +222,23 @@ class RoutingTable:
         known = self._infos.get(stream.id)
         if known is not None and _same(known, stream):
             return NO_CHANGE
-        reboot = self._boots.get(origin, boot) != boot
+        durable = stream.spec.durable
+        reboot = not durable and self._boots.get(origin, boot) != boot
         self._check(stream, reboot=reboot)
         if known is not None:
             self._infos[stream.id] = stream
             return RouteChange(updated=(stream.id,))
         change = _Collector()
         if reboot:
-            for old in tuple(self._by_client[origin].values()):
-                self._remove(old, change)
+            for old in tuple(self._by_client.get(origin, {}).values()):
+                if not self._infos[old].spec.durable:
+                    self._remove(old, change)
             self._retired.setdefault(origin, deque(maxlen=RETIRED_BOOTS)).append(self._boots[origin])
-        self._boots[origin] = boot
+        if not durable:
+            self._boots[origin] = boot
+        namesake = self._by_client.get(origin, {}).get(stream.id.topic)
+        if namesake is not None:
+            self._remove(namesake, change)
         self._add(stream, change)
         return change.result(self._routes)
 
@@ -353,7 +360,7 @@ class RoutingTable:
         problem = name_problem(topic)
         if problem is not None:
             raise RefusedError("bad_name", f"{origin} may not publish {topic[:80]!r}: the name {problem}")
-        if boot in self._retired.get(origin, ()):
+        if not stream.spec.durable and boot in self._retired.get(origin, ()):
             raise RefusedError(
                 "old_boot", f"{origin} announced {topic} for a run that it has since replaced; ignore it"
             )
@@ -494,7 +501,7 @@ class RoutingTable:
             )
             assert info.id == stream, f"{stream} is filed under another id"
             assert route == expected, f"{stream}: routes {route}, expected {expected}"
-            assert self._boots[stream.origin] == stream.boot, f"{stream} is of a retired boot"
+            assert info.spec.durable or self._boots[stream.origin] == stream.boot, f"{stream} is of a retired boot"
             assert self._topics[name].streams[stream.origin] == stream, f"{stream} does not hold its name"
             assert self._by_client[stream.origin][name] == stream, f"{stream} is not among its origin's streams"
             assert self._access.may_publish(stream.origin, name), f"{stream} may not be published"

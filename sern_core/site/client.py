@@ -4,9 +4,9 @@ The shell (sern_client) feeds it endpoint messages and lane bytes, and is told t
 appear and which messages have their turn. Everything about bandwidth, order, replay and loss is in the link below.
 """
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import ParamSpec, Protocol
 
 from sern_core.bodies.codecs import CodecProfile, Coder
@@ -93,6 +93,25 @@ class ClientEvents(Protocol):
         count it. What it was about is given up, everything else goes on."""
 
 
+@dataclass(frozen=True, slots=True)
+class KeptPlace:
+    """Where the stream of a durable topic goes on: the number of the store it is kept in, and its first message that is
+    not known to be delivered."""
+
+    boot: int
+    first: int
+
+
+@dataclass(frozen=True, slots=True)
+class KeptMessage:
+    """A message that an earlier process has kept; it is `age_s` old by now."""
+
+    seq: int
+    body: bytes
+    stamp_ns: int
+    age_s: float
+
+
 def _announced(stream: StreamInfo) -> StreamInfo:
     """What its origin says of a stream, without what is filled in here."""
     return replace(stream, info=replace(stream.info, definition=""), definition_hash="")
@@ -177,16 +196,17 @@ class ClientCore:
         *,
         now: float,
         attributes: dict[str, str] | None = None,
-        required: tuple[ClientName, ...] = (),
+        required: tuple[str, ...] = (),
+        kept: KeptPlace | None = None,
     ) -> OutChannel:
         """Offer a topic under its global name. Offering it again after `unpublish` goes on counting where it ended.
         `attributes` travel with its announcement. `required`: of a reliable topic, clients that it is for: a relay
-        that does not know them yet keeps it for them.
+        that does not know them yet keeps it for them. `kept`: of a durable topic, where its stream goes on.
 
         Raises UsageError if it is offered already, or no relay would accept it.
         """
-        identity = StreamId(self.name, self.boot, info.name)
-        first = self._numbering.last(identity) + 1
+        identity = StreamId(self.name, self.boot if kept is None else kept.boot, info.name)
+        first = self._numbering.last(identity) + 1 if kept is None else kept.first
         stream = StreamInfo(identity, info, spec, dict(attributes or {}))
         check_stream(stream)
         channel = self.link.outgoing.open(stream, first=first, required=required, now=now)
@@ -199,14 +219,33 @@ class ClientCore:
         self._latched.pop(channel.stream.id, None)
         self.link.outgoing.close(channel, DropReason.SHUTDOWN, now=now)
 
-    def send(self, channel: OutChannel, body: bytes, stamp_ns: int, *, now: float, born_s: float | None = None) -> bool:
+    def send(
+        self,
+        channel: OutChannel,
+        body: bytes,
+        stamp_ns: int,
+        *,
+        now: float,
+        born_s: float | None = None,
+        forced: bool = False,
+    ) -> bool:
         """Offer one message. False: refused, the reliable queue is full; offer it again later or count it lost.
-        `born_s`: when it was taken, if that was before `now`."""
+        `born_s`: when it was taken, if that was before `now`. `forced`: whether there is room was asked before."""
         message = Message(channel.stream.id, channel.next_seq, body, stamp_ns, now if born_s is None else born_s)
-        accepted = self.link.sender.submit(channel, message, now=now)
+        accepted = self.link.sender.submit(channel, message, now=now, forced=forced)
         if accepted and channel.spec.latched:
             self._latched[channel.stream.id].add(message)
         return accepted
+
+    def go_on(self, channel: OutChannel, messages: Iterable[KeptMessage], *, next_seq: int, now: float) -> None:
+        """Send what an earlier process has kept of a durable topic, the oldest first. What is new begins at
+        `next_seq`."""
+        for kept in messages:
+            if kept.seq > channel.next_seq:  # what lies between is gone
+                self.link.outgoing.skip(channel, kept.seq, now=now)
+            self.send(channel, kept.body, kept.stamp_ns, now=now, born_s=now - kept.age_s, forced=True)
+        if next_seq > channel.next_seq:
+            self.link.outgoing.skip(channel, next_seq, now=now)
 
     def set_compression(self, channel: OutChannel, setting: Compression | None, *, now: float) -> None:
         """Compress what leaves this channel from the next message on with another mode; None: `auto`."""
@@ -295,7 +334,8 @@ class ClientCore:
         stream = link.taking.streams[announcement.stream.id]
         digest = announcement.definition_hash
         identity = stream.stream.id
-        link.taking.outlived(identity.origin, identity.boot, now=now)
+        if not stream.stream.spec.durable:
+            link.taking.outlived(identity.origin, identity.boot, now=now)
         if identity.topic == OBJECTS_TOPIC:
             return identity.origin == link.peer
         opened = self._open.get(identity)

@@ -22,6 +22,7 @@ from sern_core.vocabulary.message import (
     DEFAULT_LIFESPAN_S,
     DEFAULT_RELIABLE_QUEUE_BYTES,
     DEFAULT_RETENTION_S,
+    DURABLE_RETENTION_S,
     KAPPA,
     TopicInfo,
     TopicSpec,
@@ -123,6 +124,7 @@ class TopicRule:
     dead_reckoning: bool = False
     lossy: tuple[Compression, ...] = ()
     lossy_params: LossyParams = DEFAULT_LOSSY
+    durable: bool = False
 
     @property
     def plain_name(self) -> TopicName | None:
@@ -218,6 +220,7 @@ class RuleSet:
         No rule: bulk, best effort, depth 1, lifespan 1 s; of the publisher's QoS only the latch is kept. Else, where
         the rule says nothing:
         - reliability, durability: the publisher's; a publisher that does not say (ROS 1) is reliable if it latches;
+          a durable topic is reliable;
         - depth: 10 if reliable, else 1;
         - lifespan and deadline: the publisher's, where it has any (DDS); else no deadline, and
         - lifespan: 0.3 s for a velocity command in class control; for ever if reliable or latched; else 1 s;
@@ -255,7 +258,7 @@ class RuleSet:
                 key=f"topics.{index - self.implied}.on_link_loss",
             )
         durability = rule.durability or durability
-        reliability = rule.reliability or _offered_reliability(info)
+        reliability = Reliability.RELIABLE if rule.durable else rule.reliability or _offered_reliability(info)
         reliable = reliability is Reliability.RELIABLE
         if rule.lifespan_s is not AUTO:
             lifespan_s = rule.lifespan_s
@@ -274,23 +277,30 @@ class RuleSet:
             lifespan_s=lifespan_s,
             deadline_s=info.deadline_s if rule.deadline_s is None else rule.deadline_s,
             max_rate_hz=rule.max_rate_hz,
-            retention_s=self.retention_s if rule.retention_s is None else rule.retention_s,
+            retention_s=self._retention_s(rule),
             max_queue_bytes=rule.max_queue_bytes,
             many_writers=many_writers if rule.many_writers is None else rule.many_writers,
             compression=rule.compression,
             lossy=rule.lossy,
             lossy_params=rule.lossy_params,
+            durable=rule.durable,
         )
-        every_one_counts = rule.reliability is Reliability.RELIABLE
+        every_one_counts = rule.durable or rule.reliability is Reliability.RELIABLE
         merge_tf = static or (transforms and rule.priority is PriorityClass.STATE and not every_one_counts)
         if rule.merge_tf is not None:
             merge_tf = transforms and rule.merge_tf
+        merge_tf = merge_tf and not rule.durable
         name = rule.remap or local_name
         summaries = rule.summaries
         if not summaries and rule.too_large is TooLarge.SUMMARY:
             summaries = stand_ins(info, spec)
         reckoned = rule.dead_reckoning and plain_type(info.type_name) == ODOMETRY_TYPE
         return ResolvedTopic(spec, rule.direction, name, rule.lease, index, summaries, merge_tf, reckoned)
+
+    def _retention_s(self, rule: TopicRule) -> float:
+        if rule.retention_s is not None:
+            return rule.retention_s
+        return DURABLE_RETENTION_S if rule.durable else self.retention_s
 
     def outward(self, info: TopicInfo, *, local_name: TopicName, namespace: str) -> TopicName:
         """The global name of a local topic: `remap`, then the namespace."""

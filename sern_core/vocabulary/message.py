@@ -21,6 +21,8 @@ DEFAULT_COMMAND_LIFESPAN_S: Final = 0.3
 """Lifespan of class control when the rule gives none and the topic is a command (paper-independent safety choice)."""
 DEFAULT_RETENTION_S: Final = 600.0
 """How long a reliable message waits for delivery before it is reported as dropped (reason `retention`)."""
+DURABLE_RETENTION_S: Final = 7 * 86_400.0
+"""The same of a durable topic: what outlives the machine's power may outlast a weekend."""
 DEFAULT_RELIABLE_QUEUE_BYTES: Final = 32 * 2**20
 """Bytes of undelivered reliable messages a topic may hold; above it new ones are refused to the sender."""
 KAPPA: Final = (10.0, 3.0, 1.0)
@@ -45,6 +47,7 @@ class TopicSpec:
     retention_s: float = DEFAULT_RETENTION_S
     max_queue_bytes: int = DEFAULT_RELIABLE_QUEUE_BYTES
     many_writers: bool = False  # several clients may own this global name, e.g. /tf
+    durable: bool = False  # reliable, and kept on disk until it is delivered
     compression: Compression | None = None  # None: whatever is quickest; for the origin alone, never on the wire
     lossy: tuple[Compression, ...] = ()  # modes that may lose something; for the origin alone
     lossy_params: LossyParams = DEFAULT_LOSSY
@@ -81,7 +84,8 @@ class TopicInfo:
 class StreamId(NamedTuple):
     """One publisher's sequence of messages: the unit of order, acknowledgement and replay.
 
-    `boot` is a random 63-bit number that the origin draws once a process; a restarted origin is a new stream.
+    `boot` is a random 63-bit number that the origin draws once a process; a restarted origin is a new stream. Where the
+    origin keeps the stream on disk (`TopicSpec.durable`) it is the store's number: the next process goes on with it.
     """
 
     origin: ClientName

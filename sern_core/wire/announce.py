@@ -81,6 +81,8 @@ def encode_announcement(announcement: Announcement) -> framing.Envelope:
         "attr": dict(stream.attributes),
         "more": announcement.more,
     }
+    if spec.durable:
+        envelope["kept"] = True
     while envelope["owed"] and framing.envelope_bytes(envelope) > framing.MAX_ENVELOPE_BYTES:
         envelope["owed"].pop()
     return envelope
@@ -153,7 +155,10 @@ def decode_announcement(envelope: framing.Envelope) -> Announcement:
         deadline_s=framing.take_float(envelope, "dead", low=0.0, high=MAX_TIME_S),
         retention_s=retention_s,
         many_writers=framing.take_bool(envelope, "mw"),
+        durable=framing.take_bool(envelope, "kept"),
     )
+    if spec.durable and not spec.reliable:
+        raise WireError("a stream that is kept on disk is reliable")
     info = TopicInfo(
         name=topic,
         type_name=framing.take_str(envelope, "type", max_length=NAME_MAX_CHARS),

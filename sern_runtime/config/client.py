@@ -60,6 +60,7 @@ from sern_runtime.config.objects import MAX_SELECTIONS, TOPIC_KINDS, ObjectSelec
 from sern_runtime.config.scene import SceneSection
 from sern_runtime.config.shared import (
     ClassWord,
+    DurableSection,
     HttpSection,
     LinkSection,
     LogSection,
@@ -201,8 +202,12 @@ class TopicSection(Section):
     max_rate_hz: Hertz | None = None
     """Faster messages of a best-effort topic are thinned to this rate; null: all. The newest waits for its turn, so the
     last one always goes. Leave commands without: they would wait, too."""
+    durable: bool = False
+    """Reliable, and kept on disk from the moment it is taken until it is delivered: it outlives the end of this process
+    and of the machine's power. Needs the section `durable`; on TOPIC/sern/stored this site's nodes see how many are on
+    disk. Not for commands."""
     retention_s: Seconds | None = None
-    """How long an undelivered reliable message is kept; null: `link.retention_s`."""
+    """How long an undelivered reliable message is kept; null: `link.retention_s`, and 7 days where it is durable."""
     max_queue_bytes: Bytes = DEFAULT_RELIABLE_QUEUE_BYTES
     """Undelivered reliable messages kept at most, each counted with 768 bytes beside its own; beyond, new ones are
     refused to their publisher."""
@@ -267,6 +272,24 @@ class TopicSection(Section):
             raise fault(
                 "leaves poses out, and of a reliable topic every message counts; use best_effort", "dead_reckoning"
             )
+        if self.durable:
+            for key, given, why in (
+                (
+                    "reliability",
+                    self.reliability == "best_effort",
+                    "is best_effort, and of a durable topic every message counts",
+                ),
+                ("summary", bool(self.summary), "is not for a durable topic, of which every message is kept as it is"),
+                (
+                    "dead_reckoning",
+                    self.dead_reckoning,
+                    "leaves poses out, and of a durable topic every message counts",
+                ),
+                ("merge_tf", bool(self.merge_tf), "leaves transforms out, and of a durable topic every message counts"),
+                ("durable", self.commands, "keeps commands for later, which a robot must never get; leave it out"),
+            ):
+                if given:
+                    raise fault(why, key)
         if self.on_link_loss is not None:
             if self.direction is Direction.SEND:
                 raise fault("acts where commands arrive; direction is send", "on_link_loss")
@@ -324,6 +347,7 @@ class TopicSection(Section):
             too_large=TooLarge(self.too_large),
             merge_tf=self.merge_tf,
             dead_reckoning=self.dead_reckoning,
+            durable=self.durable,
         )
 
 
@@ -460,6 +484,8 @@ class ClientFile(FileModel):
     """Services offered to other sites and used from them."""
     actions: ActionsSection = ActionsSection()
     """Actions offered to other sites and used from them."""
+    durable: DurableSection | None = None
+    """Where messages of durable topics are kept; null: there are no such topics."""
     scheduler: SchedulerSection = SchedulerSection()
     """Which message the link carries next."""
     adaptation: AdaptationSection | None = None
@@ -499,6 +525,14 @@ class ClientFile(FileModel):
             what = "" if error.text is None else f"pattern {error.text!r} "
             at = ("subscribe",) if self.subscribe else ()
             raise fault(f"all that it subscribes to: {what}{error}", *at) from error
+        return self
+
+    @model_validator(mode="after")
+    def _durable_has_a_place(self) -> "ClientFile":
+        for index, section in enumerate(self.topics):
+            if section.durable and self.durable is None:
+                text = "needs a place on disk: durable: {directory: /var/lib/sern/durable}"
+                raise fault(text, "topics", index, "durable")
         return self
 
     @model_validator(mode="after")
@@ -584,6 +618,8 @@ class ClientFile(FileModel):
                 yield FileProblem(("topics", index, "max_rate_hz"), problem, warning=True)
         yield from output_problems(base_dir, self.message_log, ("message_log",))
         yield from output_problems(base_dir, self.summary, ("summary",))
+        if self.durable is not None:
+            yield from self.durable.problems(base_dir)
 
     def _services_only_problems(self) -> Iterator[FileProblem]:
         """A warning of endpoints that leave topics to others, where there are none."""

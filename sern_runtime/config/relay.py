@@ -44,6 +44,7 @@ from sern_runtime.config.keys import KeyDirectory
 from sern_runtime.config.load import Loaded, load
 from sern_runtime.config.shared import (
     ClassWord,
+    DurableSection,
     LinkSection,
     LogSection,
     SchedulerSection,
@@ -283,6 +284,9 @@ class RelayFile(FileModel):
     """Plain ZMQ for programs on the local network."""
     replay: ReplaySection = ReplaySection()
     """What is kept for clients that come late or come back."""
+    durable: DurableSection | None = None
+    """Where messages of durable topics are kept until all clients that subscribe to them have them; null: they are
+    relayed as other reliable ones."""
     scheduler: SchedulerSection = SchedulerSection()
     """Which message each client's link carries next."""
     adaptation: AdaptationSection | None = None
@@ -364,6 +368,8 @@ class RelayFile(FileModel):
         yield from self._rule_problems()
         yield from output_problems(base_dir, self.message_log, ("message_log",))
         yield from output_problems(base_dir, self.summary, ("summary",))
+        if self.durable is not None:
+            yield from self.durable.problems(base_dir)
         if self.relay.secret_key_file is not None:
             loc = ("relay", "secret_key_file")
             yield from secret_key_problems(base_dir, self.relay.secret_key_file, loc, owner=self.name)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from enum import StrEnum
 from math import inf
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Final, Literal, get_args
 
 from pydantic import Field
 
@@ -29,6 +29,7 @@ from sern_runtime.config.base import (
 from sern_runtime.config.keys import PUBLIC_SUFFIX, load_public, load_secret, load_server_keys, secret_warning
 from sern_runtime.config.yaml import Loc
 from sern_runtime.dscp import DSCP_NAMES, Marks
+from sern_runtime.durable.names import DURABLE_FILE
 
 ClassWord = Literal["control", "state", "bulk"]
 DscpName = Literal[
@@ -182,6 +183,26 @@ class LogSection(Section):
     """The least severe messages that are written."""
     format: LogFormat = LogFormat.TEXT
     """`text`: a line a person reads; `json`: one object a line."""
+
+
+class DurableSection(Section):
+    """What is kept on disk of durable topics."""
+
+    directory: PathText
+    """A directory for it alone, made if it is not there, on a disk that keeps what it was told to sync. Each daemon
+    needs its own."""
+    max_bytes: Bytes = 256 * 2**20
+    """Bytes kept at most, over all topics; beyond, new messages are refused to their publisher."""
+
+    def problems(self, base_dir: Path) -> Iterator[FileProblem]:
+        """Problems of the directory, as the file's own."""
+        directory = resolve(base_dir, self.directory)
+        yield from output_problems(
+            base_dir, str(directory / DURABLE_FILE if directory.is_dir() else directory), DIRECTORY
+        )
+
+
+DIRECTORY: Final[Loc] = ("durable", "directory")
 
 
 def public_key_problems(base_dir: Path, text: PathText, loc: Loc, *, client: str) -> Iterator[FileProblem]:

@@ -1,0 +1,167 @@
+"""Writes to the store in a thread of its own, many messages with one sync (group commit).
+
+While one commit is on its way to the disk the next batch gathers, so a quiet topic waits for one sync and a busy one
+shares it. What only makes room (`Trim`, `Place`) waits for company, `IDLE_S` at most.
+"""
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from sern_core.vocabulary.message import StreamId
+from sern_runtime.durable.store import ROW_BYTES, Change, Put, Store, StoreError, Trim
+
+IDLE_S: Final = 0.25
+RETRY_S: Final = 1.0
+"""How often a disk that did not take a batch is asked again."""
+BATCH_BYTES: Final = 4 * 2**20
+"""Bodies of one commit: it holds nothing up, but all of it is to be read again if it fails."""
+
+_log = logging.getLogger(__name__)
+
+
+class Keeper:
+    """`stored(changes)` is called in the loop, by `call_soon`, with what is on disk now, in its order. `problem`: why
+    nothing gets there, None: it does."""
+
+    def __init__(
+        self,
+        store: Store,
+        *,
+        call_soon: Callable[..., object],
+        stored: Callable[[Sequence[Put]], None],
+        max_bytes: int,
+    ) -> None:
+        self._store = store
+        self._call_soon = call_soon
+        self._stored = stored
+        self._max_bytes = max_bytes
+        self._changes: deque[Change] = deque()
+        self._urgent = 0  # of those, how many somebody waits for
+        self._closing = False
+        self._condition = threading.Condition()
+        self._thread = threading.Thread(target=self._run, name="durable", daemon=True)
+        self._sizes: dict[StreamId, deque[tuple[int, int]]] = {}  # of what is kept: seq, bytes
+        self.kept_bytes = 0
+        """What is kept, or about to be, overhead included."""
+        self.problem: str | None = None
+        self.messages = 0
+        self.commits = 0
+        self.failures = 0
+
+    # --- in the loop ----------------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def has_room(self, size_bytes: int) -> bool:
+        """Whether a message of this size may be put."""
+        return self.kept_bytes + size_bytes + ROW_BYTES <= self._max_bytes
+
+    def found(self, stream: StreamId, seq: int, size_bytes: int) -> None:
+        """This message was in the store from the beginning."""
+        self._sizes.setdefault(stream, deque()).append((seq, size_bytes + ROW_BYTES))
+        self.kept_bytes += size_bytes + ROW_BYTES
+
+    def put(self, change: Put) -> None:
+        """Keep a message; the seqs of a stream rise."""
+        self.found(change.stream, change.row.seq, len(change.row.body))
+        self._add(change, urgent=True)
+
+    def trim(self, stream: StreamId, upto: int) -> None:
+        """Let go of what is delivered."""
+        sizes = self._sizes.get(stream, ())
+        while sizes and sizes[0][0] <= upto:
+            self.kept_bytes -= sizes.popleft()[1]
+        if not sizes:
+            self._sizes.pop(stream, None)
+        self._add(Trim(stream, upto), urgent=False)
+
+    def change(self, change: Change) -> None:
+        """Whatever else is to be written, in its turn."""
+        self._add(change, urgent=False)
+
+    def _add(self, change: Change, *, urgent: bool) -> None:
+        with self._condition:
+            self._changes.append(change)
+            self._urgent += urgent
+            self._condition.notify()
+
+    def close(self) -> None:
+        """Write what waits, if the disk takes it, and end the thread."""
+        with self._condition:
+            self._closing = True
+            self._condition.notify()
+        if self._thread.is_alive():
+            self._thread.join()
+        left = sum(isinstance(change, Put) for change in self._changes)
+        if left:
+            _log.error("%d durable messages could not be kept, and are lost if nobody got them: %s", left, self.problem)
+
+    # --- in the thread --------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        try:
+            while True:
+                batch = self._take()
+                if batch is None:
+                    return
+                if not self._write(batch):
+                    with self._condition:
+                        self._changes.extendleft(reversed(batch))
+                    return
+        finally:
+            self._store.close()
+
+    def _take(self) -> list[Change] | None:
+        """The next batch, once there is one; None: there is none, and nothing more will come."""
+        with self._condition:
+            self._condition.wait_for(lambda: self._changes or self._closing)
+            self._condition.wait_for(lambda: self._urgent or self._closing, timeout=IDLE_S)
+            if not self._changes:
+                return None
+            batch: list[Change] = []
+            size_bytes = 0
+            while self._changes and size_bytes < BATCH_BYTES:
+                change = self._changes.popleft()
+                batch.append(change)
+                if isinstance(change, Put):
+                    self._urgent -= 1
+                    size_bytes += len(change.row.body) + ROW_BYTES
+            return batch
+
+    def _write(self, batch: list[Change]) -> bool:
+        """Have a batch on disk, however long that takes. False: we are closing, and it does not take it."""
+        while True:
+            try:
+                self._store.apply(batch)
+            except StoreError as error:
+                self.failures += 1
+                self._call_soon(self._failed, str(error))
+            else:
+                self.commits += 1
+                puts = [change for change in batch if isinstance(change, Put)]
+                self._call_soon(self._done, puts)
+                return True
+            with self._condition:
+                if self._condition.wait_for(lambda: self._closing, timeout=RETRY_S):
+                    return False
+
+    # --- in the loop again ----------------------------------------------------------------------------------------
+
+    def _failed(self, problem: str) -> None:
+        if self.problem is None:
+            _log.error(
+                "nothing is acknowledged on durable topics: %s; make room or mend the disk, it is tried again", problem
+            )
+        self.problem = problem
+
+    def _done(self, puts: list[Put]) -> None:
+        if self.problem is not None:
+            _log.error("durable topics are kept again")
+            self.problem = None
+        self.messages += len(puts)
+        if puts:
+            self._stored(puts)

@@ -1,0 +1,58 @@
+"""Durable topics at their origin: real daemons, killed without a word."""
+
+from pathlib import Path
+
+from sern_client.endpoints.bag_files import BagFile
+from sern_core.vocabulary.types import Encoding
+from sern_runtime.ros_types import topic_info
+from tests.daemons import Lab, Process, bodies
+
+COUNT = 3000
+TOPIC = "/robot1/chat"
+RULES = [{"match": "/chat", "class": "state", "durable": True}]
+
+
+def write_bag(path: Path, name: str, count: int) -> Path:
+    """Numbered texts on one topic, one a millisecond."""
+    file = BagFile(path)
+    info = topic_info(name, "std_msgs/msg/String", Encoding.ROS1)
+    file.add(info)
+    for number in range(count):
+        text = f"message {number:05}".encode()
+        file.write(info, 10**18 + number * 10**6, len(text).to_bytes(4, "little") + text)
+    file.finish()
+    return path
+
+
+def metric(process: Process, name: str) -> int:
+    """A metric without labels; 0 before the daemon answers."""
+    _status, text = process.get("/metrics")
+    return sum(int(float(line.split()[1])) for line in text.splitlines() if line.startswith(f"{name} "))
+
+
+async def test_what_a_killed_robot_has_stored_arrives_once_and_in_order(tmp_path: Path) -> None:
+    """The relay is gone, then the robot is killed. Its next process, which has no such publisher any more, and another
+    relay bring what was on disk to the site that never left: all of it, once, in order."""
+    bag, other = write_bag(tmp_path / "run.bag", "/chat", COUNT), write_bag(tmp_path / "other.bag", "/other", 1)
+    sent = bodies(bag)["/chat"]
+    durable = {"directory": "kept"}
+    async with Lab(tmp_path, "robot1", "site1") as lab:
+        relay = lab.process(lab.relay_file())
+        site = lab.process(lab.recorder_file("site1", "/.*"))
+        await site.said("connected to relay")
+        play = {"rate": 0.1}
+        robot = lab.process(lab.player_file("robot1", bag, play=play, topics=RULES, durable=durable))
+        await robot.until(lambda: metric(robot, "sern_durable_stored_total") > 50, "has stored some")
+        relay.kill()
+        await robot.until(lambda: metric(robot, "sern_durable_stored_total") > 250, "has stored more, with no relay")
+        stored = metric(robot, "sern_durable_stored_total")
+        robot.kill()
+        relay = lab.process(tmp_path / "relay.yaml")
+        again = lab.process(lab.player_file("robot1", other, play={"rate": 1}, topics=RULES, durable=durable))
+        await again.said("messages of an earlier run are sent now")
+        await again.until(lambda: metric(again, "sern_durable_kept_bytes") == 0, "has had all of it delivered")
+        await again.stop()
+        await site.stop()
+        await relay.stop()
+    got = bodies(tmp_path / "site1.bag")[TOPIC]
+    assert got == sent[: len(got)] and len(got) >= stored
