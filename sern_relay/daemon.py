@@ -24,6 +24,7 @@ from sern_core.vocabulary.message import Message, StreamInfo
 from sern_core.vocabulary.types import ClientName
 from sern_relay.admission import ZAP_DOMAIN, Admission, read_directory
 from sern_relay.comings import Comings
+from sern_relay.durable import DurableHolding
 from sern_relay.feed import RelayFeed
 from sern_relay.objects_view import objects_view
 from sern_relay.readers import Readers
@@ -140,6 +141,16 @@ class RelayDaemon:
                     kick=self._after,
                     parts=self.parts,
                 )
+        self.durable: DurableHolding | None = None
+        if model.durable is not None:
+            self.durable = DurableHolding(
+                loaded.resolve(model.durable.directory),
+                self.hub,
+                max_bytes=model.durable.max_bytes,
+                known=self.admission.known,
+                now=clock.now,
+                after=self._after,
+            )
         self.zap: ZapHandler | None = None
         self.server: RelayServer | None = None
         self.lanes: RelayLanes | None = None
@@ -170,6 +181,9 @@ class RelayDaemon:
             with blamed_on(self.loaded.path, "http", "listen"):
                 self._http = self._make_http(model.http.listen)
                 await self._http.start()
+        if self.durable is not None:
+            with blamed_on(self.loaded.path, "durable", "directory"):
+                self.durable.start(asyncio.get_running_loop().call_soon_threadsafe)
         self._ctx = zmq.Context()
         self.readers.transforms = TransformObjects(self.hub.objects, parts=self.parts)
         if keys is not None:
@@ -433,6 +447,8 @@ class RelayDaemon:
             if self._http is not None:
                 stack.push_async_callback(self._http.stop)
             stack.callback(self.codecs.close)
+            if self.durable is not None:
+                stack.callback(self.durable.close)
             stack.callback(self._cancel_flush)
             stack.push_async_callback(end_tasks, self.tasks)
 

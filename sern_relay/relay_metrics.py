@@ -5,6 +5,7 @@ from typing import Protocol
 
 from sern_core.bodies.codecs import Coder
 from sern_core.relay.hub import Hub
+from sern_relay.durable import DurableHolding
 from sern_relay.feed import RelayFeed
 from sern_relay.readers import Readers
 from sern_relay.reload_state import ReloadState
@@ -13,6 +14,7 @@ from sern_relay.transforms import TransformObjects
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.collector import CollectorWatch
 from sern_runtime.datagram_watch import DatagramWatch
+from sern_runtime.durable.durable_metrics import register_durable
 from sern_runtime.internal_errors import InternalErrors
 from sern_runtime.link_metrics import register_codecs, register_links, register_received
 from sern_runtime.metrics import Metrics
@@ -34,6 +36,7 @@ class Counting(Protocol):
     zap: ZapHandler | None
     readers: Readers
     reloads: ReloadState
+    durable: DurableHolding | None
 
     @property
     def refusals(self) -> Mapping[str, int]:
@@ -51,6 +54,7 @@ def register_relay(metrics: Metrics, relay: Counting) -> None:
     register_received(metrics, hub.received, relay.readers.ages)
     register_codecs(metrics, relay.coder)
     relay.errors.register(metrics)
+    register_durable(metrics, relay.durable)
     relay.collector.register(metrics)
     relay.parts.register(metrics)
     if relay.adaptation is not None:

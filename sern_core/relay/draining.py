@@ -75,6 +75,10 @@ class Draining:
             for identity in [identity for identity in entries if not rule(client, identity)]:
                 self._end(client, identity, reason, now)
 
+    def channels(self, stream: StreamId) -> dict[ClientName, OutChannel]:
+        """The channels of an ended stream, by client."""
+        return {client: entries[stream][1] for client, entries in self._by_client.items() if stream in entries}
+
     def has(self, client: ClientName) -> bool:
         return client in self._by_client
 
@@ -110,7 +114,8 @@ class Draining:
 
 
 def _held_bytes(channel: OutChannel) -> int:
-    return channel.retained_bytes + MESSAGE_OVERHEAD_BYTES * len(channel.retained)
+    """What counts against the bound. What is on disk as well has a bound there, and was promised."""
+    return 0 if channel.spec.durable else channel.retained_bytes + MESSAGE_OVERHEAD_BYTES * len(channel.retained)
 
 
 def _same(one: StreamInfo, other: StreamInfo) -> bool:

@@ -1,5 +1,6 @@
 """Messages through the relay: from one link, unchanged, to those of all subscribers. Pure."""
 
+from collections.abc import Callable
 from typing import Final
 
 from sern_core.link.link import Link
@@ -37,6 +38,8 @@ class Forwarding:
         self.received = ReceiveLedger()
         self.fates: Fates | None = None
         """Told what becomes of each message here; set before the first client comes."""
+        self.hold: Callable[[Relayed, Message, float], None] = lambda _relayed, _message, _now: None
+        """Told of messages of durable streams; set by the owner."""
 
     def message(self, link: Link, stream: InStream, message: Message, now: float) -> None:
         """A message (or drop marker) of a client has its turn."""
@@ -101,6 +104,8 @@ class Forwarding:
             except Exception as error:  # noqa: BLE001  (of that client's link: the others get theirs)
                 self._not_taken(relayed, out_link, channel, message, error, now)
             behind = behind or channel.watermark >= message.seq
+        if stream.stream.spec.durable:
+            self.hold(relayed, message, now)
         if not message.drop_marker:
             self._keep(relayed, message, now)
         return behind

@@ -26,6 +26,7 @@ from sern_core.relay.absent import AbsentClients
 from sern_core.relay.access import AccessTable
 from sern_core.relay.clients import Clients
 from sern_core.relay.forwarding import Forwarding
+from sern_core.relay.holding import Holding
 from sern_core.relay.hub_events import GuardedEvents, HubEvents, Relayed
 from sern_core.relay.hub_matching import Matching
 from sern_core.relay.hub_port import HubPort
@@ -138,6 +139,10 @@ class Hub:
             refused=self.events.refused,
             attempt=clients.attempt,
         )
+        self.holding = Holding(clients, streams, self.definitions.get)
+        """Durable streams, where the shell has a place on disk for them."""
+        streams.on_disk = self.holding.position
+        self.forwarding.hold = self.holding.message
         self.absent = AbsentClients(clients, streams, self.routing, self.events, known, link.limits)
 
     # --- how the parts hang together ------------------------------------------------------------------------------
@@ -195,9 +200,11 @@ class Hub:
         and then `lapse`."""
         self.lapse(now=now)
         for client in self.clients.gone(now):
-            self.clients.attempt(client, now, partial(self._forget, client, now))
+            if not self.holding.owes(client):
+                self.clients.attempt(client, now, partial(self._forget, client, now))
         self.clients.sweep_orphans(now)
         self.streams.draining.sweep(now=now)
+        self.holding.look(now=now)
         self.clients.sweep(now)
         if now >= self._tidy_due_s:
             self._tidy_due_s = now + TIDY_S
@@ -318,6 +325,9 @@ class Hub:
             raise RefusedError("origin", f"{link.peer} announced a stream of {identity.origin}")
         if identity.topic == OBJECTS_TOPIC:
             return True
+        on_disk = self.holding.position(identity)
+        if on_disk > stream.delivered:  # an earlier run of ours has it, and its origin may not know yet
+            stream.delivered = stream.confirmed = on_disk
         try:
             relayed = self.streams.take(link, stream, now)
         except RefusedError as refusal:

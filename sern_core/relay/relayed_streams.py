@@ -59,6 +59,8 @@ class RelayedStreams:
         self.draining = Draining(self._end_channel, limits)
         self.tap: Callable[[StreamInfo], bool] = lambda _stream: False
         """Whether the relay itself wants a stream (a subscriber of the feed); set by the shell."""
+        self.on_disk: Callable[[StreamId], int] = lambda _stream: 0
+        """Up to which seq a durable stream is on disk here; set by the owner."""
         self._unsubscribed: OutChannel | None = None  # is being closed because its subscriber wants it no more
         self._room: tuple[ClientName, float, int] | None = None  # for replays to a client at this time
 
@@ -348,6 +350,8 @@ class RelayedStreams:
         delivered = stream.delivered
         for _link, channel in relayed.outs.values():
             delivered = min(delivered, channel.watermark)
+        if stream.stream.spec.durable:  # what is on disk is ours to deliver
+            delivered = max(delivered, min(self.on_disk(stream.stream.id), stream.delivered))
         source.taking.confirm(stream, delivered)
 
     def reports(self, link: Link, channel: OutChannel, reason: DropReason) -> Relayed | None:

@@ -56,3 +56,65 @@ async def test_what_a_killed_robot_has_stored_arrives_once_and_in_order(tmp_path
         await relay.stop()
     got = bodies(tmp_path / "site1.bag")[TOPIC]
     assert got == sent[: len(got)] and len(got) >= stored
+
+
+async def test_what_a_killed_relay_has_stored_reaches_a_site_that_was_away(tmp_path: Path) -> None:
+    """The relay holds for a site that is away what its robot need not keep any more. Then robot and relay are killed:
+    the next relay delivers it, once and in order, though the robot never comes back."""
+    bag = write_bag(tmp_path / "run.bag", "/chat", COUNT)
+    sent = bodies(bag)["/chat"]
+    async with Lab(tmp_path, "robot1", "site1") as lab:
+        relay_file = lab.relay_file(durable={"directory": "held"})
+        relay = lab.process(relay_file)
+        site = lab.process(lab.recorder_file("site1", "/.*"))
+        await site.said("connected to relay")
+        play = {"rate": 0.1}
+        config = lab.player_file("robot1", bag, play=play, topics=RULES, durable={"directory": "kept"})
+        robot = lab.process(config)
+        await robot.until(lambda: metric(robot, "sern_durable_stored_total") > 50, "has stored some")
+        await site.stop()
+        first = bodies(tmp_path / "site1.bag")[TOPIC]
+        await relay.until(lambda: metric(relay, "sern_durable_stored_total") > len(first) + 100, "has stored some more")
+        robot.kill()
+        stored = metric(relay, "sern_durable_stored_total")
+        relay.kill()
+        relay = lab.process(relay_file)
+        await relay.said("messages of durable topics of an earlier run wait for their clients")
+        site = lab.process(lab.recorder_file("site1", "/.*", path="later"))
+        await relay.until(lambda: metric(relay, "sern_durable_kept_bytes") == 0, "has delivered all of it")
+        await site.stop()
+        await relay.stop()
+    got = [*first, *bodies(tmp_path / "later.bag")[TOPIC]]
+    assert got == sent[: len(got)] and len(got) >= stored
+
+
+async def test_robot_and_relay_go_on_together_after_both_were_killed(tmp_path: Path) -> None:
+    """What the relay has, the robot's next process need not send; what it lacks comes from the robot."""
+    bag, other = write_bag(tmp_path / "run.bag", "/chat", COUNT), write_bag(tmp_path / "other.bag", "/other", 1)
+    sent = bodies(bag)["/chat"]
+    async with Lab(tmp_path, "robot1", "site1") as lab:
+        relay_file = lab.relay_file(durable={"directory": "held"})
+        relay = lab.process(relay_file)
+        site = lab.process(lab.recorder_file("site1", "/.*"))
+        await site.said("connected to relay")
+        durable = {"directory": "kept"}
+        robot = lab.process(lab.player_file("robot1", bag, play={"rate": 0.1}, topics=RULES, durable=durable))
+        await robot.until(lambda: metric(robot, "sern_durable_stored_total") > 50, "has stored some")
+        await site.stop()
+        first = bodies(tmp_path / "site1.bag")[TOPIC]
+        await relay.until(lambda: metric(relay, "sern_durable_stored_total") > len(first) + 100, "has stored some more")
+        relay.kill()
+        await robot.until(lambda: metric(robot, "sern_durable_stored_total") > len(first) + 250, "goes on")
+        stored = metric(robot, "sern_durable_stored_total")
+        robot.kill()
+        relay = lab.process(relay_file)
+        await relay.said("messages of durable topics of an earlier run wait for their clients")
+        robot = lab.process(lab.player_file("robot1", other, play={"rate": 1}, topics=RULES, durable=durable))
+        await robot.until(lambda: metric(robot, "sern_durable_kept_bytes") == 0, "has had all of it stored")
+        site = lab.process(lab.recorder_file("site1", "/.*", path="later"))
+        await relay.until(lambda: metric(relay, "sern_durable_kept_bytes") == 0, "has delivered all of it")
+        await site.stop()
+        await robot.stop()
+        await relay.stop()
+    got = [*first, *bodies(tmp_path / "later.bag")[TOPIC]]
+    assert got == sent[: len(got)] and len(got) >= stored
