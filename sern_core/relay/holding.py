@@ -18,7 +18,7 @@ from sern_core.vocabulary.message import Message, StreamId, StreamInfo
 from sern_core.vocabulary.types import ClientName
 
 IDLE_S: Final = 3600.0
-"""How long it is remembered up to where a stream was stored that has no origin and waits for nobody: its origin may come
+"""How long it is remembered how far a stream was stored that has no origin and waits for nobody: its origin may come
 back, and send again what it does not know to be stored."""
 
 

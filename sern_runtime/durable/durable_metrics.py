@@ -25,12 +25,21 @@ def register_durable(metrics: Metrics, durable: Durable | None) -> None:
         keeper = None if durable is None else durable.keeper
         return 0.0 if keeper is None else float(getattr(keeper, name))
 
-    for name, key, text in (
-        ("sern_durable_stored_total", "messages", "Messages of durable topics that were put on disk."),
-        ("sern_durable_commits_total", "commits", "Times that messages, one or many, were put on disk together."),
-        ("sern_durable_failures_total", "failures", "Times that the disk did not take them; it is tried again."),
-    ):
-        metrics.counter(name, text, read=lambda key=key: [((), read(key))])
+    metrics.counter(
+        "sern_durable_stored_total",
+        "Messages of durable topics that were put on disk.",
+        read=lambda: [((), read("messages"))],
+    )
+    metrics.counter(
+        "sern_durable_commits_total",
+        "Times that messages, one or many, were put on disk together.",
+        read=lambda: [((), read("commits"))],
+    )
+    metrics.counter(
+        "sern_durable_failures_total",
+        "Times that the disk did not take them; it is tried again.",
+        read=lambda: [((), read("failures"))],
+    )
     metrics.gauge(
         "sern_durable_kept_bytes", "What is kept on disk of durable topics.", read=lambda: [((), read("kept_bytes"))]
     )

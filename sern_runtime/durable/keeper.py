@@ -153,9 +153,7 @@ class Keeper:
 
     def _failed(self, problem: str) -> None:
         if self.problem is None:
-            _log.error(
-                "nothing is acknowledged on durable topics: %s; make room or mend the disk, it is tried again", problem
-            )
+            _log.error("durable topics wait for the disk: %s; make room, or mend it: it is tried again", problem)
         self.problem = problem
 
     def _done(self, puts: list[Put]) -> None:

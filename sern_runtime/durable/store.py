@@ -10,7 +10,7 @@ A damaged file is put aside (`NAME.damaged-1`), never deleted; what can be read 
 
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -167,7 +167,7 @@ class Store:
         db.pragma("locking_mode", "exclusive")  # a second daemon would number its messages as this one does
         db.pragma("journal_mode", "persist")
         db.pragma("synchronous", "extra")
-        with db:
+        with _transaction(db):
             db.execute(_SCHEMA)
         self.path.chmod(0o600)
         return db
@@ -188,7 +188,7 @@ class Store:
         damage = [] if check == "ok" else [f"{self.path} is damaged: {str(check).splitlines()[-1]}"]
         version = db.execute("select value from meta where name = 'version'").get
         if version is None and not damage:
-            with db:
+            with _transaction(db):
                 db.execute("insert into meta values ('version', ?), ('boot', ?)", (VERSION, new_boot))
         elif version not in (None, VERSION):
             raise ConfigError(f"is of version {version}; this SERN reads version {VERSION}", file=str(self.path))
@@ -235,7 +235,7 @@ class Store:
             self.path.with_name(f"{DURABLE_FILE}-journal").unlink(missing_ok=True)
             self._ids.clear()
             db = self._connect()
-            with db:
+            with _transaction(db):
                 db.execute("insert into meta values ('version', ?), ('boot', ?)", (VERSION, contents.boot))
             self.apply(list(_changes(contents)))
         except (OSError, apsw.Error) as error:
@@ -256,7 +256,7 @@ class Store:
             if self._db is None:
                 self._connect()
             assert self._db is not None
-            with self._db:
+            with _transaction(self._db):
                 self._write(self._db, changes, trims)
         except apsw.Error as error:
             self._ids = known
@@ -319,6 +319,20 @@ class Store:
         db, self._db = self._db, None
         if db is not None:
             db.close(force=True)
+
+
+@contextmanager
+def _transaction(db: apsw.Connection) -> Iterator[None]:
+    """All of it or nothing; what went wrong is raised as it was, also where SQLite has rolled back by itself."""
+    db.execute("begin immediate")
+    try:
+        yield
+        db.execute("commit")
+    except BaseException:
+        if db.in_transaction:
+            with suppress(apsw.Error):
+                db.execute("rollback")
+        raise
 
 
 def _message(number: int, row: Row) -> tuple[Any, ...]:

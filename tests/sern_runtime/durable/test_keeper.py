@@ -1,0 +1,119 @@
+"""The keeper: group commit, acknowledged only what is on disk, a disk that fails and comes back."""
+
+import asyncio
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from sern_core.vocabulary.message import StreamId
+from sern_core.vocabulary.types import ClientName, TopicName
+from sern_runtime.durable.keeper import Keeper
+from sern_runtime.durable.store import ROW_BYTES, Change, Described, Put, Row, Store, StoreError
+from tests.support import until
+
+STREAM = StreamId(ClientName("robot1"), 7, TopicName("/robot1/log"))
+
+
+class Gate(Store):
+    """A store that takes nothing while it is `full`, and writes down its batches."""
+
+    def __init__(self, directory: Path) -> None:
+        super().__init__(directory)
+        self.full = False
+        self.batches: list[int] = []
+
+    def apply(self, changes: Sequence[Change]) -> None:
+        if self.full:
+            raise StoreError("the disk is full")
+        super().apply(changes)
+        self.batches.append(sum(isinstance(change, Put) for change in changes))
+
+
+def make(store: Store, got: list[int], *, max_bytes: int = 2**20) -> Keeper:
+    store.open(new_boot=7)
+
+    def stored(puts: Sequence[Put]) -> None:
+        got.extend(change.row.seq for change in puts)
+
+    call_soon = asyncio.get_running_loop().call_soon_threadsafe
+    keeper = Keeper(store, call_soon=call_soon, stored=stored, max_bytes=max_bytes)
+    keeper.change(Described(STREAM, {}, "", (), 0))
+    return keeper
+
+
+def put(seq: int, size: int = 10) -> Put:
+    return Put(STREAM, Row(seq, seq, seq, bytes(size)))
+
+
+async def test_many_messages_share_a_commit_and_each_is_acknowledged_in_order(tmp_path: Path) -> None:
+    got: list[int] = []
+    store = Gate(tmp_path)
+    keeper = make(store, got)
+    for seq in range(1, 501):
+        keeper.put(put(seq))
+    keeper.start()
+    await until(lambda: len(got) == 500, "all are acknowledged")
+    keeper.close()
+    assert got == list(range(1, 501)) and keeper.messages == 500
+    assert store.batches[0] == 500
+    assert len(Store(tmp_path).open(new_boot=1).streams[STREAM].rows) == 500
+
+
+async def test_a_full_disk_is_said_once_and_nothing_is_acknowledged_until_it_takes_them(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    got: list[int] = []
+    store = Gate(tmp_path)
+    keeper = make(store, got)
+    store.full = True
+    keeper.start()
+    keeper.put(put(1))
+    await until(lambda: keeper.failures > 1, "it was tried again")
+    assert keeper.problem == "the disk is full" and not got
+    keeper.put(put(2))
+    store.full = False
+    await until(lambda: got == [1, 2], "both are acknowledged")
+    keeper.close()
+    assert keeper.problem is None
+    lines = [record.getMessage() for record in caplog.records]
+    assert lines == [
+        "durable topics wait for the disk: the disk is full; make room, or mend it: it is tried again",
+        "durable topics are kept again",
+    ]
+
+
+async def test_closing_writes_what_waits(tmp_path: Path) -> None:
+    keeper = make(Store(tmp_path), [])
+    keeper.start()
+    for seq in range(1, 4):
+        keeper.put(put(seq))
+    keeper.trim(STREAM, 1)
+    keeper.close()
+    assert [row.seq for row in Store(tmp_path).open(new_boot=1).streams[STREAM].rows] == [2, 3]
+
+
+async def test_closing_with_a_full_disk_says_what_is_not_kept(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    got: list[int] = []
+    store = Gate(tmp_path)
+    keeper = make(store, got)
+    store.full = True
+    keeper.start()
+    keeper.put(put(1))
+    keeper.put(put(2))
+    await until(lambda: keeper.problem is not None, "the disk has refused")
+    keeper.close()
+    assert "2 durable messages could not be kept, and are lost if nobody got them: the disk is full" in caplog.text
+    assert not got
+
+
+async def test_room_is_counted(tmp_path: Path) -> None:
+    keeper = make(Store(tmp_path), [], max_bytes=2 * (100 + ROW_BYTES))
+    keeper.start()
+    assert keeper.has_room(100)
+    keeper.put(put(1, 100))
+    keeper.put(put(2, 100))
+    assert not keeper.has_room(0) and keeper.kept_bytes == 2 * (100 + ROW_BYTES)
+    keeper.trim(STREAM, 1)
+    assert keeper.has_room(100) and not keeper.has_room(101)
+    keeper.close()
