@@ -57,6 +57,8 @@ from sern_runtime.collector import CollectorWatch
 from sern_runtime.config.client import ClientFile, ServicesSection, load_client
 from sern_runtime.config.keys import load_secret, load_server_keys
 from sern_runtime.config.load import Loaded
+from sern_runtime.durable.keeper import Keeper, Stored
+from sern_runtime.durable.store import Store
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.http_routes import Health
 from sern_runtime.internal_errors import InternalErrors
@@ -189,7 +191,13 @@ class ClientDaemon:
         if section is None:
             return None
         directory, most = self.loaded.resolve(section.directory), section.max_bytes
-        return lambda core: DurableTopics(directory, max_bytes=most, core=core, now=clock.now)
+        store = Store(directory)
+
+        def keeper(stored: Stored) -> Keeper:
+            call_soon = asyncio.get_running_loop().call_soon_threadsafe
+            return Keeper(store, call_soon=call_soon, stored=stored, max_bytes=most)
+
+        return lambda core: DurableTopics(store, keeper, core=core, now=clock.now)
 
     def _rule_of(self, info: TopicInfo) -> TopicSpec:
         """How a topic of this site is treated, by its global name."""
@@ -263,7 +271,7 @@ class ClientDaemon:
                 await self._http.start()
         if self.bridge.durable is not None:  # before the endpoint, whose topics go on where they were
             with blamed_on(self.loaded.path, "durable", "directory"):
-                self.bridge.durable.start(asyncio.get_running_loop().call_soon_threadsafe, self._rule_of)
+                self.bridge.durable.start(self._rule_of)
         # Before the transport: streams from the relay are advertised at the endpoint as soon as there is a session.
         events = self.bridge.outbound if self.scene is None else BothTold(self.bridge.outbound, self.scene)
         await self.site.endpoint.start(events)

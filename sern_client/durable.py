@@ -10,7 +10,6 @@ import secrets
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from sern_core.site.client import ClientCore, KeptMessage, KeptPlace
@@ -19,11 +18,11 @@ from sern_core.stream.prices import MESSAGE_OVERHEAD_BYTES
 from sern_core.vocabulary.errors import UsageError, WireError
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.wire.announce import Announcement, decode_announcement, definition_hash, encode_announcement
-from sern_runtime.durable.keeper import Keeper
-from sern_runtime.durable.store import Contents, Described, Forget, KeptStream, Put, Row, Store, StoreError
+from sern_runtime.durable.keeper import Keeps, OpensStore, Stored
+from sern_runtime.durable.store import Contents, Described, Forget, KeptStream, Put, Row, StoreError
 
 Send = Callable[[bytes, int, float | None], bool]
-Stored = Callable[[int], None]
+StoredCount = Callable[[int], None]
 """`stored(count)`: so many messages of a topic are on disk, of all that this store has ever had."""
 
 _log = logging.getLogger(__name__)
@@ -59,22 +58,32 @@ class _Topic:
         self.required = channel.required
         self.leaving = True
         self.send: Send | None = None
-        self.stored: Stored | None = None
+        self.stored: StoredCount | None = None
         self.trimmed = channel.watermark
         self.waiting: deque[_Waiting] = deque()
         self.waiting_bytes = 0
 
 
 class DurableTopics:
-    """The durable topics of one client, whose files are in `directory`. `now` is the clock of the core."""
+    """The durable topics of one client. `make_keeper` makes what writes to the store. `now` is the clock of the core,
+    `wall_ns` the one that goes on while the machine is off."""
 
-    def __init__(self, directory: Path, *, max_bytes: int, core: ClientCore, now: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        store: OpensStore,
+        make_keeper: Callable[[Stored], Keeps],
+        *,
+        core: ClientCore,
+        now: Callable[[], float],
+        wall_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self._store = store
+        self._make_keeper = make_keeper
         self._core = core
         self._now = now
-        self._store = Store(directory)
+        self._wall_ns = wall_ns
         self._topics: dict[StreamId, _Topic] = {}
-        self._keeper: Keeper | None = None
-        self._max_bytes = max_bytes
+        self._keeper: Keeps | None = None
         self._found: dict[StreamId, KeptStream] = {}
         self._boot = 0
         self._closed = False
@@ -95,11 +104,11 @@ class DurableTopics:
         return self._problem or (None if self._keeper is None else self._keeper.problem)
 
     @property
-    def keeper(self) -> Keeper | None:
+    def keeper(self) -> Keeps | None:
         """What writes; None: nothing is kept by this process."""
         return self._keeper
 
-    def start(self, call_soon: Callable[..., object], rule: Callable[[TopicInfo], TopicSpec]) -> None:
+    def start(self, rule: Callable[[TopicInfo], TopicSpec]) -> None:
         """Begin to write, and offer what earlier processes have left. `rule` says how a global topic is treated now.
 
         Raises ConfigError for a directory that cannot be used. Where the disk is full or fails, `problem` says so, and
@@ -112,7 +121,7 @@ class DurableTopics:
             _log.error("durable topics are not kept by this process: %s; make room and start it again", error)
             return
         self._took(contents)
-        self._keeper = Keeper(self._store, call_soon=call_soon, stored=self._stored, max_bytes=self._max_bytes)
+        self._keeper = self._make_keeper(self._stored)
         for stream, found in self._found.items():
             for row in found.rows:
                 self._keeper.found(stream, row.seq, len(row.body))
@@ -154,14 +163,14 @@ class DurableTopics:
         channel = self._core.publish(info, spec, now=self._now(), required=required, kept=KeptPlace(self._boot, first))
         topic = self._topics[identity] = _Topic(channel, last + 1)
         self._describe(topic, last)
-        wall_ns = time.time_ns()
+        wall_ns = self._wall_ns()
         messages = [KeptMessage(row.seq, row.body, row.stamp_ns, max(0, wall_ns - row.born_ns) * 1e-9) for row in rows]
         self._core.go_on(channel, messages, next_seq=last + 1, now=self._now())
         if messages:
             _log.warning("%s: %d messages of an earlier run are sent now", info.name, len(messages))
         return channel
 
-    def sender(self, channel: OutChannel, send: Send, stored: Stored | None) -> Send:
+    def sender(self, channel: OutChannel, send: Send, stored: StoredCount | None) -> Send:
         """What takes messages of this topic: they are kept, and given to `send` when they are on disk. `stored` is told
         then. False: there is no room."""
         topic = self._topics.get(channel.stream.id)
@@ -182,7 +191,7 @@ class DurableTopics:
             seq, topic.next_seq = topic.next_seq, topic.next_seq + 1
             topic.waiting.append(_Waiting(seq, body, stamp_ns, born_s))
             topic.waiting_bytes += size
-            keeper.put(Put(channel.stream.id, Row(seq, time.time_ns() - int((now - born_s) * 1e9), stamp_ns, body)))
+            keeper.put(Put(channel.stream.id, Row(seq, self._wall_ns() - int((now - born_s) * 1e9), stamp_ns, body)))
             return True
 
         return keep

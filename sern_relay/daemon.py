@@ -43,6 +43,8 @@ from sern_runtime.config.load import Loaded
 from sern_runtime.config.relay import RelayFile, load_relay
 from sern_runtime.datagram_watch import DatagramWatch
 from sern_runtime.draining import Progress
+from sern_runtime.durable.keeper import Keeper, Stored
+from sern_runtime.durable.store import Store
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.http_routes import Health
 from sern_runtime.internal_errors import InternalErrors
@@ -143,14 +145,7 @@ class RelayDaemon:
                 )
         self.durable: DurableHolding | None = None
         if model.durable is not None:
-            self.durable = DurableHolding(
-                loaded.resolve(model.durable.directory),
-                self.hub,
-                max_bytes=model.durable.max_bytes,
-                known=self.admission.known,
-                now=clock.now,
-                after=self._after,
-            )
+            self.durable = self._make_durable(loaded.resolve(model.durable.directory), model.durable.max_bytes)
         self.zap: ZapHandler | None = None
         self.server: RelayServer | None = None
         self.lanes: RelayLanes | None = None
@@ -170,6 +165,16 @@ class RelayDaemon:
         clients_dir = loaded.model.relay.clients_dir
         return read_directory(None if clients_dir is None else loaded.resolve(clients_dir))
 
+    def _make_durable(self, directory: Path, max_bytes: int) -> DurableHolding:
+        store = Store(directory)
+
+        def keeper(stored: Stored) -> Keeper:
+            call_soon = asyncio.get_running_loop().call_soon_threadsafe
+            return Keeper(store, call_soon=call_soon, stored=stored, max_bytes=max_bytes)
+
+        known, after = self.admission.known, self._after
+        return DurableHolding(store, keeper, self.hub, known=known, now=clock.now, after=after)
+
     async def start(self) -> None:
         self.errors.watch(asyncio.get_running_loop())
         self.collector.watch()
@@ -183,7 +188,7 @@ class RelayDaemon:
                 await self._http.start()
         if self.durable is not None:
             with blamed_on(self.loaded.path, "durable", "directory"):
-                self.durable.start(asyncio.get_running_loop().call_soon_threadsafe)
+                self.durable.start()
         self._ctx = zmq.Context()
         self.readers.transforms = TransformObjects(self.hub.objects, parts=self.parts)
         if keys is not None:

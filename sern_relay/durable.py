@@ -4,42 +4,43 @@ import logging
 import secrets
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 from sern_core.relay.hub import Hub
 from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo
 from sern_core.vocabulary.types import ClientName
 from sern_core.wire.announce import Announcement, decode_announcement, encode_announcement
-from sern_runtime.durable.keeper import Keeper
-from sern_runtime.durable.store import Described, Forget, KeptStream, Place, Put, Row, Store, StoreError
+from sern_runtime.durable.keeper import Keeps, OpensStore, Stored
+from sern_runtime.durable.store import Described, Forget, KeptStream, Place, Put, Row, StoreError
 
 _log = logging.getLogger(__name__)
 
 
 class DurableHolding:
-    """The `Shelf` of a hub, with its files in `directory`. `known` says whether a client is in the directory of keys,
-    `after` is called when something may have to be sent."""
+    """The `Shelf` of a hub. `make_keeper` makes what writes to the store. `known` says whether a client is in the
+    directory of keys; `after` is called when something may have to be sent."""
 
     def __init__(
         self,
-        directory: Path,
+        store: OpensStore,
+        make_keeper: Callable[[Stored], Keeps],
         hub: Hub,
         *,
-        max_bytes: int,
         known: Callable[[ClientName], bool],
         now: Callable[[], float],
         after: Callable[[], None],
+        wall_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        self._store = Store(directory)
+        self._store = store
+        self._make_keeper = make_keeper
         self._hub = hub
-        self._max_bytes = max_bytes
+        self._wall_ns = wall_ns
         self._known = known
         self._now = now
         self._after = after
         self._problem: str | None = None
         self._closed = False
-        self.keeper: Keeper | None = None
+        self.keeper: Keeps | None = None
         """What writes; None: nothing is kept by this process."""
         self.damaged = 0
         """Messages, and other things, that could not be read when the store was opened."""
@@ -49,7 +50,7 @@ class DurableHolding:
         """Why nothing is kept at the moment; None: it is."""
         return self._problem or (None if self.keeper is None else self.keeper.problem)
 
-    def start(self, call_soon: Callable[..., object]) -> None:
+    def start(self) -> None:
         """Begin to write, and bring back what there is; before any client connects. Raises ConfigError. Where the disk
         is full or fails, `problem` says so, and durable topics are for this process what reliable ones are."""
         try:
@@ -61,7 +62,7 @@ class DurableHolding:
         self.damaged = len(contents.damage)
         for line in contents.damage:
             _log.error("durable topics: %s", line)
-        keeper = self.keeper = Keeper(self._store, call_soon=call_soon, stored=self._stored, max_bytes=self._max_bytes)
+        keeper = self.keeper = self._make_keeper(self._stored)
         waiting = 0
         for found in contents.streams.values():
             for row in found.rows:
@@ -81,7 +82,7 @@ class DurableHolding:
             return 0
         stream = announcement.stream
         stream.definition_hash = announcement.definition_hash
-        now, wall_ns = self._now(), time.time_ns()
+        now, wall_ns = self._now(), self._wall_ns()
         messages = [
             Message(
                 found.id,
@@ -107,7 +108,7 @@ class DurableHolding:
         keeper = self.keeper
         if keeper is None or self._closed or not keeper.has_room(len(message.body)):
             return False
-        born_ns = time.time_ns() - int((now - message.born_s) * 1e9)
+        born_ns = self._wall_ns() - int((now - message.born_s) * 1e9)
         row = Row(message.seq, born_ns, message.stamp_ns, message.body, int(message.codec), message.drop_marker)
         keeper.put(Put(message.stream, row))
         return True

@@ -2,7 +2,7 @@
 
 from typing import Protocol
 
-from sern_runtime.durable.keeper import Keeper
+from sern_runtime.durable.keeper import Keeps
 from sern_runtime.metrics import Metrics
 
 
@@ -12,7 +12,7 @@ class Durable(Protocol):
     damaged: int
 
     @property
-    def keeper(self) -> Keeper | None: ...
+    def keeper(self) -> Keeps | None: ...
 
     @property
     def problem(self) -> str | None: ...

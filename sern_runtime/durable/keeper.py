@@ -8,10 +8,10 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Final
+from typing import Final, Protocol
 
 from sern_core.vocabulary.message import StreamId
-from sern_runtime.durable.store import ROW_BYTES, Change, Put, Store, StoreError, Trim
+from sern_runtime.durable.store import ROW_BYTES, Change, Contents, Put, Store, StoreError, Trim
 
 IDLE_S: Final = 0.25
 RETRY_S: Final = 1.0
@@ -20,6 +20,42 @@ BATCH_BYTES: Final = 4 * 2**20
 """Bodies of one commit: it holds nothing up, but all of it is to be read again if it fails."""
 
 _log = logging.getLogger(__name__)
+
+
+Stored = Callable[[Sequence[Put]], None]
+"""`stored(puts)`: these are on disk now, in this order."""
+
+
+class Keeps(Protocol):
+    """What a user of the store sees of a `Keeper`."""
+
+    kept_bytes: int
+    problem: str | None
+    messages: int
+    commits: int
+    failures: int
+
+    def start(self) -> None: ...
+
+    def has_room(self, size_bytes: int) -> bool: ...
+
+    def found(self, stream: StreamId, seq: int, size_bytes: int) -> None: ...
+
+    def put(self, change: Put) -> None: ...
+
+    def trim(self, stream: StreamId, upto: int) -> None: ...
+
+    def change(self, change: Change) -> None: ...
+
+    def close(self) -> None: ...
+
+
+class OpensStore(Protocol):
+    """What a user of the store sees of a `Store`."""
+
+    def open(self, *, new_boot: int) -> Contents: ...
+
+    def close(self) -> None: ...
 
 
 class Keeper:
@@ -31,7 +67,7 @@ class Keeper:
         store: Store,
         *,
         call_soon: Callable[..., object],
-        stored: Callable[[Sequence[Put]], None],
+        stored: Stored,
         max_bytes: int,
     ) -> None:
         self._store = store

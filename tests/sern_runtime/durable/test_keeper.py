@@ -75,7 +75,7 @@ async def test_a_full_disk_is_said_once_and_nothing_is_acknowledged_until_it_tak
     store.full = False
     await until(lambda: got == [1, 2], "both are acknowledged")
     keeper.close()
-    assert keeper.problem is None
+    assert not keeper.problem
     lines = [record.getMessage() for record in caplog.records]
     assert lines == [
         "durable topics wait for the disk: the disk is full; make room, or mend it: it is tried again",

@@ -1,0 +1,127 @@
+"""Durable topics in virtual time: whatever dies, what was acknowledged arrives once and in order."""
+
+import random
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from sern_core.vocabulary.message import TopicSpec
+from sern_core.vocabulary.types import PriorityClass, Reliability
+from sern_sim.models import LinkModel, Window
+from tests.exploring import cases
+from tests.sern_core.system.durable_world import DurableRelay, DurableRobot, SimDisk
+from tests.world import World
+
+SPEC = TopicSpec(
+    priority=PriorityClass.STATE,
+    reliability=Reliability.RELIABLE,
+    depth=10,
+    lifespan_s=None,
+    retention_s=1e6,
+    durable=True,
+)
+TOPIC = "/robot/log"
+THIN = LinkModel(rate_bps=256e3, delay_s=0.05, disconnect_after_s=2.0, reconnect_s=0.5).as_stream()
+
+
+class Play:
+    """A robot that publishes ten times a second, a site that is there all along, and a relay. Robot and relay have
+    disks. `site`: the link of the site."""
+
+    def __init__(self, seed: int, *, relay_disk: bool = True, site: LinkModel = THIN) -> None:
+        self.rng = random.Random(seed)
+        world = self.world = World(seed).watch(0.25)
+        self.robot = DurableRobot(world, world.client("robot", THIN), SimDisk(), TOPIC, SPEC)
+        self.relay = DurableRelay(world, SimDisk()) if relay_disk else None
+        self.site = world.client("site", site, patterns=["/robot/.*"])
+        world.network.every(0.5, self.robot.look)
+        world.run(8.0)
+        self.stop = world.network.every(0.1, lambda _now: self.robot.offer()).cancel
+
+    def kill_robot(self) -> None:
+        self.robot.begin(self.world.restart_client("robot"))
+
+    def kill_relay(self) -> None:
+        self.world.restart_relay()
+        if self.relay is not None:
+            self.relay.begin()
+
+    def kill_both(self) -> None:
+        self.kill_relay()
+        self.kill_robot()
+
+    def robot_link(self) -> None:
+        self.world.hops["robot"].break_connection()
+
+    def site_link(self) -> None:
+        self.world.hops["site"].break_connection()
+
+    def finish(self) -> list[int]:
+        """Let everything arrive. Returns what the site got, in its order."""
+        self.stop()
+        self.world.run(2.0)
+        self.world.until(self.world.quiet, within_s=600.0, what="everything has arrived")
+        self.world.run(2.0)
+        return [int(got.body) for got in self.site.on(TOPIC)]
+
+    def check(self) -> None:
+        got = self.finish()
+        assert got == sorted(set(got)), "twice, or out of order"
+        lost = self.robot.acknowledged - set(got)
+        assert not lost, f"acknowledged, and lost: {sorted(lost)}"
+        assert len(got) > 10
+
+
+@pytest.mark.parametrize("seed", range(cases(25)))
+@pytest.mark.parametrize("relay_disk", [True, False])
+def test_what_was_acknowledged_arrives_once_whatever_dies(seed: int, relay_disk: bool) -> None:
+    play = Play(seed, relay_disk=relay_disk)
+    deeds: list[Callable[[], None]] = [
+        play.kill_robot, play.kill_relay, play.kill_both, play.robot_link, play.site_link,
+    ]  # fmt: skip
+    for _ in range(play.rng.randint(1, 5)):
+        play.world.run(play.rng.choice((0.03, 0.3, 1.0, 3.0)))
+        play.rng.choice(deeds)()
+    play.world.run(3.0)
+    play.check()
+
+
+def test_the_relay_frees_the_robot_of_what_a_site_that_is_away_will_get() -> None:
+    """The site is cut off for a minute, in which relay and robot are killed: the robot keeps nothing of what the relay
+    has stored for the site."""
+    away = replace(THIN, blackouts=(Window(10.0, 70.0),))
+    play = Play(3, site=away)
+    play.world.run(12.0)
+    assert len(play.robot.channel.retained) < 15
+    play.kill_both()
+    play.world.run(12.0)
+    assert len(play.robot.channel.retained) < 15 and len(play.site.on(TOPIC)) < 30
+    play.world.run(50.0)
+    play.check()
+    assert play.robot.acknowledged == {int(got.body) for got in play.site.on(TOPIC)}
+
+
+def test_a_full_disk_acknowledges_nothing_and_loses_nothing() -> None:
+    play = Play(5)
+    play.world.run(1.0)
+    play.robot.disk.full = True
+    before = len(play.robot.acknowledged)
+    play.world.run(2.0)
+    assert len(play.robot.acknowledged) <= before + 1
+    play.robot.disk.full = False
+    play.world.run(1.0)
+    play.check()
+    assert play.robot.acknowledged == set(range(1, play.robot.offered + 1))
+
+
+def test_a_full_disk_of_the_relay_leaves_messages_with_the_robot() -> None:
+    """The site gets them all the same, and the robot keeps what the site has not confirmed."""
+    play = Play(6)
+    assert play.relay is not None
+    play.relay.disk.full = True
+    play.world.run(2.0)
+    play.kill_relay()
+    play.world.run(2.0)
+    play.relay.disk.full = False
+    play.check()
