@@ -23,6 +23,7 @@ from sern_core.vocabulary.types import (
     Encoding,
     ObjectKind,
     PriorityClass,
+    Reliability,
     TopicName,
 )
 from sern_core.wire import framing
@@ -218,7 +219,7 @@ def _object(value: bytes | None, *, upto: int | None) -> Put:
     )
 
 
-def _announcement() -> Vector:
+def _announcement(*, kept: bool = False) -> Vector:
     identity = StreamId(ClientName("jackal1"), 2**63 - 1, TopicName("/jackal1/map"))
     info = TopicInfo(identity.topic, "nav_msgs/msg/OccupancyGrid", Encoding.CDR, "RIHS01_" + "0f" * 32)
     spec = TopicSpec(
@@ -228,6 +229,8 @@ def _announcement() -> Vector:
         depth=2,
         lifespan_s=None,
         deadline_s=0.5,
+        reliability=Reliability.RELIABLE if kept else Reliability.BEST_EFFORT,
+        durable=kept,
     )
     stream = StreamInfo(identity, info, spec, {"frame": "map"})
     return encode_announcement(Announcement(3, stream, definition_hash(DEFINITION), 40, ("site1", "site2")))
@@ -313,6 +316,7 @@ def valid() -> list[Vector]:
         ),
         _data("no-frames", "nothing but a header is a valid datagram", number=0),
         _control("announce", "a stream on channel 3 of its sender", _announcement()),
+        _control("announce-kept", "the same stream, reliable and kept on disk by its origin", _announcement(kept=True)),
         _control(
             "want", "channel 3 is wanted by two clients", {"t": "want", "ch": 3, "on": True, "owed": ["site1", "site2"]}
         ),

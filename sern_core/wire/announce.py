@@ -78,11 +78,12 @@ def encode_announcement(announcement: Announcement) -> framing.Envelope:
         "dead": spec.deadline_s,
         "ret": spec.retention_s,
         "mw": spec.many_writers,
+        "kept": spec.durable,
         "attr": dict(stream.attributes),
         "more": announcement.more,
     }
-    if spec.durable:
-        envelope["kept"] = True
+    if not spec.durable:  # who does not know the word need not see it
+        del envelope["kept"]
     while envelope["owed"] and framing.envelope_bytes(envelope) > framing.MAX_ENVELOPE_BYTES:
         envelope["owed"].pop()
     return envelope
