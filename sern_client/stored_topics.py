@@ -46,7 +46,7 @@ class StoredTopics:
             stored = ros_types.topic_info(topic_name(info.name + SUFFIX), TYPE, encoding, latched=True, reliable=True)
             self._publishers[info.name] = stored, self._advertise(stored)
         except (ConfigError, UsageError) as error:
-            _log.warning("%s: how much of it is on disk is not published: %s", info.name, error)
+            _log.info("%s: how much of it is on disk is not published: %s", info.name, error)
             return None
         head = b"" if encoding is Encoding.ROS1 else _CDR_HEAD
 
