@@ -1,47 +1,106 @@
 """Counters of topics as JSON: for /api/topics, the summaries written at exit, and the tools that read them."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict
-from typing import Any
+from typing import Any, NamedTuple
 
 from sern_core.link.link import Link
-from sern_core.link.view import CodecView
+from sern_core.link.view import CodecView, Held
+from sern_core.link.view import TopicView as Open
 from sern_core.objects.changes import OBJECTS_TOPIC
-from sern_core.vocabulary.ledger import ReceiveLedger
+from sern_core.vocabulary.ledger import NO_DROPS, ReceiveCounters, ReceiveLedger
 from sern_core.vocabulary.message import StreamInfo
-from sern_core.vocabulary.types import CLASS_LABELS
+from sern_core.vocabulary.types import CLASS_LABELS, DropReason, TopicName
 
 TopicView = dict[str, Any]
 """The counters of one topic, as `json.dumps` takes them."""
 
 
+class _Sent(NamedTuple):
+    """What a row of `link_rows` is made of, as it was when the link was looked at."""
+
+    topic: str
+    priority: int
+    wanted: bool
+    answered: bool
+    max_rate_hz: float | None
+    thinned: int
+    offered: int
+    delivered: int
+    dropped: int
+    reasons: Mapping[DropReason, int]
+    refused: int
+    held: Held
+    offered_bytes: int
+    delivered_bytes: int
+    codec: CodecView | None
+
+
 def link_summary(link: Link, *, direction: str) -> dict[str, TopicView]:
     """What was offered to a link and what became of it: offered = delivered + dropped + in_queue + in_flight."""
+    return dict(link_rows(link, direction=direction))
+
+
+def link_rows(link: Link, *, direction: str) -> Iterator[tuple[str, TopicView]]:
+    """The same, each row made when it is asked for: the link is looked at when the first is, and 2,000 topics take
+    some milliseconds then. `answered`: the peer has said whether it wants it; `thinned`: left out for a share that the
+    adaptation has set."""
+    for sent in _look(link):
+        yield (
+            sent.topic,
+            {
+                "class": CLASS_LABELS[sent.priority],
+                "direction": direction,
+                "wanted": sent.wanted,
+                "answered": sent.answered,
+                "max_rate_hz": sent.max_rate_hz,
+                "offered": sent.offered,
+                "sent": sent.offered - sent.dropped - sent.held.queued,
+                "delivered": sent.delivered,
+                "dropped": {str(reason): n for reason, n in sent.reasons.items() if n and reason != "refused"},
+                "refused": sent.refused,
+                "thinned": sent.thinned,
+                "in_queue": sent.held.queued,
+                "in_flight": sent.held.in_flight,
+                "bytes_offered": sent.offered_bytes,
+                "bytes_delivered": sent.delivered_bytes,
+                **_codec_view(sent.codec),
+            },
+        )
+
+
+def _look(link: Link) -> list[_Sent]:
     held = link.held()
-    views = link.topics()
-    codecs = {view.stream.id.topic: view.codec for view in views}
-    wanted = {view.stream.id.topic for view in views if view.wanted}
-    result: dict[str, TopicView] = {}
+    open_now: dict[str, list[Open]] = {}
+    for view in link.topics():
+        open_now.setdefault(view.stream.id.topic, []).append(view)
+    nothing = Held(0, 0)
+    found = []
     for topic, counters in link.counters.items():
         if topic == OBJECTS_TOPIC:
             continue  # is nobody's topic; the metrics have it
-        in_queue, in_flight = held.get(topic, (0, 0))
-        result[topic] = {
-            "class": CLASS_LABELS[counters.priority],
-            "direction": direction,
-            "wanted": topic in wanted,
-            "offered": counters.offered,
-            "sent": counters.offered - counters.dropped - in_queue,
-            "delivered": counters.delivered,
-            "dropped": {str(reason): n for reason, n in counters.by_reason.items() if n and reason != "refused"},
-            "refused": counters.refused,
-            "in_queue": in_queue,
-            "in_flight": in_flight,
-            "bytes_offered": counters.offered_bytes,
-            "bytes_delivered": counters.delivered_bytes,
-            **_codec_view(codecs.get(topic)),
-        }
-    return result
+        views = open_now.get(topic, ())
+        by_reason = counters.by_reason
+        found.append(
+            _Sent(
+                topic,
+                counters.priority,
+                any(view.wanted for view in views),
+                any(view.wanted is not None for view in views),
+                views[-1].spec.max_rate_hz if views else None,
+                sum(view.thinned for view in views),
+                counters.offered,
+                counters.delivered,
+                counters.dropped,
+                {} if by_reason is NO_DROPS else dict(by_reason),
+                counters.refused,
+                held.get(topic, nothing),
+                counters.offered_bytes,
+                counters.delivered_bytes,
+                views[-1].codec if views else None,
+            )
+        )
+    return found
 
 
 def _codec_view(codec: CodecView | None) -> TopicView:
@@ -71,17 +130,25 @@ def announced_summary(streams: Iterable[tuple[StreamInfo, bool]]) -> dict[str, T
 
 def received_summary(received: ReceiveLedger, *, now: float) -> dict[str, TopicView]:
     """What arrived, by topic, and how old the freshest sample of each is."""
+    return dict(received_rows(received, now=now))
+
+
+def received_rows(received: ReceiveLedger, *, now: float) -> Iterator[tuple[str, TopicView]]:
+    """The same, each row made when it is asked for."""
+    for counters in tuple(received.topics.values()):
+        yield counters.topic, _arrived(counters, now)
+
+
+def _arrived(counters: ReceiveCounters, now: float) -> TopicView:
+    by_reason = counters.by_reason
     return {
-        counters.topic: {
-            "class": CLASS_LABELS[counters.priority],
-            "direction": "receive",
-            "delivered": counters.delivered,
-            "bytes_delivered": counters.delivered_bytes,
-            "dropped": {str(reason): n for reason, n in counters.by_reason.items() if n},
-            "age_s": counters.age_of_information_s(now),
-            "last_age_s": counters.age_s,
-        }
-        for counters in received.topics.values()
+        "class": CLASS_LABELS[counters.priority],
+        "direction": "receive",
+        "delivered": counters.delivered,
+        "bytes_delivered": counters.delivered_bytes,
+        "dropped": {} if by_reason is NO_DROPS else {str(reason): n for reason, n in by_reason.items() if n},
+        "age_s": counters.age_of_information_s(now),
+        "last_age_s": counters.age_s,
     }
 
 
@@ -90,18 +157,24 @@ def both_ways(link: Link, received: ReceiveLedger, *, now: float) -> dict[str, T
 
     One that goes both ways (/tf of several robots) has what arrived under `received`.
     """
-    topics = link_summary(link, direction="send")
-    for topic, arrived in received_summary(received, now=now).items():
-        if topic in topics:
-            topics[topic]["received"] = arrived
-        else:
-            topics[topic] = arrived
+    return dict(both_rows(link, received, now=now))
+
+
+def both_rows(link: Link, received: ReceiveLedger, *, now: float) -> Iterator[tuple[str, TopicView]]:
+    """The same, each row made when it is asked for. The link is looked at when the first is."""
     types: dict[str, str] = {}
     owners: dict[str, set[str]] = {}
     for stream in (*(view.stream for view in link.topics()), *link.arriving()):
         types.setdefault(stream.id.topic, stream.info.type_name)
         owners.setdefault(stream.id.topic, set()).add(stream.id.origin)
-    for topic, view in topics.items():
-        view["type"] = types.get(topic, "")
-        view["owner"] = ",".join(sorted(owners.get(topic, ())))
-    return topics
+
+    def about(topic: str) -> TopicView:
+        return {"type": types.get(topic, ""), "owner": ",".join(sorted(owners.get(topic, ())))}
+
+    arrived = dict(received.topics)
+    for name, view in link_rows(link, direction="send"):
+        counters = arrived.pop(TopicName(name), None)
+        received_too = {} if counters is None else {"received": _arrived(counters, now)}
+        yield name, view | received_too | about(name)
+    for topic, counters in arrived.items():
+        yield topic, _arrived(counters, now) | about(topic)

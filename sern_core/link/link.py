@@ -83,6 +83,10 @@ class Link:
         self.definitions = definitions
         self.finish: Callable[[Link, float], bool] | None = None
         """Called before more is read: whether all that came of what was read before is done by now."""
+        self.heard_s: float | None = None
+        """When the peer was last heard, on whatever lane; None: never."""
+        self.heard_bytes = 0
+        """Bytes of all that it has sent, headers included."""
         self._unreadable: RemoteError | None = None  # found at a time when nobody could be told
         end = self.end = End(name=name, boot=boot, peer=peer, initiator=initiator, params=link, trace=trace, now=now)
         owner = self._owner = Owner(self, handler, end)
@@ -265,6 +269,8 @@ class Link:
     def receive(self, data: framing.Datagram, *, now: float, lane: int = LANE_ZMQ) -> None:
         """One datagram from the lane. Raises WireError or VersionError for bytes no honest peer sends; the session has
         ended then, as it has after an error of ours, of which the owner is told (`on_fault`)."""
+        self.heard_s = now
+        self.heard_bytes += len(data)
         try:
             if data[:4] == self.end.data_prefix and framing.HEADER_BYTES <= len(data) <= framing.MAX_DATAGRAM_BYTES:
                 state = self.lanes.by_id.get(lane)
