@@ -64,19 +64,21 @@ class Comings:
     def up(self, client: ClientName, *, resumed: bool) -> None:
         now = clock.now()
         coming = self._of(client, now)
-        before, coming.address = coming.address, self._address(client) or coming.address
+        before, coming.address = coming.address, self._address(client)
         away_s = now - coming.since_s if coming.waited_for else None
         coming.up, coming.since_s, coming.why, coming.waited_for = True, now, "", False
         coming.sessions += 1
-        details = {"address": coming.address, "resumed": resumed}
+        details: dict[str, object] = {"address": coming.address, "resumed": resumed}
         if before and before != coming.address:
-            details["before"] = before
+            details["address_before"] = before
+        where = f", from {coming.address}" if coming.address else ""
         if away_s is None:
             again = " again" if resumed else ""
-            self._events.say(_log, logging.INFO, CONNECTED, client, "%s connected%s", client, again, **details)
+            words = "%s connected%s%s"
+            self._events.say(_log, logging.INFO, CONNECTED, client, words, client, again, where, **details)
         else:
             self._events.say(
-                _log, logging.INFO, CONNECTED, client, "%s connected again, after %.0f s", client, away_s,
+                _log, logging.INFO, CONNECTED, client, "%s connected again, after %.0f s%s", client, away_s, where,
                 away_s=away_s, **details,
             )  # fmt: skip
 

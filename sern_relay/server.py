@@ -257,7 +257,11 @@ class RelayServer:
     def address(self, client: ClientName) -> str:
         """Where the client's session comes from by TCP; empty while it has no such connection."""
         port = self.hub.clients.port_of.get(client)
-        return "" if port is None else port.address
+        if port is not None:
+            return port.address
+        # A session is told of before it has its connection: that is then the newest of the client.
+        own = [served.port.address for connection, served in self.clients.sessions() if connection.client == client]
+        return own[-1] if own else ""
 
     def cut_client(self, client: str) -> int:
         """End every connection of a client at once; returns how many there were."""

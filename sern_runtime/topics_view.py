@@ -120,11 +120,21 @@ def _codec_view(codec: CodecView | None) -> TopicView:
 
 
 def announced_summary(streams: Iterable[tuple[StreamInfo, bool]]) -> dict[str, TopicView]:
-    """Every topic that is announced at a relay, and whether anybody takes it: `taken`, of its streams any."""
+    """Every topic that is announced at a relay, who publishes it, and whether anybody takes it: `taken`, of its streams
+    any."""
     result: dict[str, TopicView] = {}
     for stream, taken in streams:
-        view = result.setdefault(stream.id.topic, {"class": CLASS_LABELS[stream.spec.priority], "taken": False})
+        view = result.setdefault(
+            stream.id.topic,
+            {
+                "class": CLASS_LABELS[stream.spec.priority],
+                "taken": False,
+                "owners": [],
+                "latched": stream.spec.latched,
+            },
+        )
         view["taken"] = view["taken"] or taken
+        view["owners"].append(stream.id.origin)
     return result
 
 
@@ -163,13 +173,17 @@ def both_ways(link: Link, received: ReceiveLedger, *, now: float) -> dict[str, T
 def both_rows(link: Link, received: ReceiveLedger, *, now: float) -> Iterator[tuple[str, TopicView]]:
     """The same, each row made when it is asked for. The link is looked at when the first is."""
     types: dict[str, str] = {}
+    latched: set[str] = set()
     owners: dict[str, set[str]] = {}
     for stream in (*(view.stream for view in link.topics()), *link.arriving()):
         types.setdefault(stream.id.topic, stream.info.type_name)
         owners.setdefault(stream.id.topic, set()).add(stream.id.origin)
+        if stream.spec.latched:
+            latched.add(stream.id.topic)
 
     def about(topic: str) -> TopicView:
-        return {"type": types.get(topic, ""), "owner": ",".join(sorted(owners.get(topic, ())))}
+        owner = ",".join(sorted(owners.get(topic, ())))
+        return {"type": types.get(topic, ""), "owner": owner, "latched": topic in latched}
 
     arrived = dict(received.topics)
     for name, view in link_rows(link, direction="send"):
