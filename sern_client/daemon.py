@@ -387,7 +387,7 @@ class ClientDaemon:
             json_routes={
                 **self.views.routes(),
                 **({} if self.scene is None else {"/api/scene": self.scene.to_json}),
-                **({} if adaptation is None else {"/api/mmcf": adaptation.to_json}),
+                **({} if adaptation is None else {"/api/mmcf": adaptation.view()}),
                 **(self.site.endpoint.json_routes if isinstance(self.site.endpoint, ServedEndpoint) else {}),
             },
             parts=self.parts,

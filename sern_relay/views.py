@@ -47,7 +47,7 @@ class RelayViews:
             "/api/objects": objects_view(self._hub),
             "/api/topics": lambda: JsonParts(self._topics(), TOO_LARGE),
             "/api/trace": trace_view(of_hub(self._hub), clock.now),
-            **({} if adaptation is None else {"/api/mmcf": adaptation.to_json}),
+            **({} if adaptation is None else {"/api/mmcf": adaptation.view()}),
         }
 
     def topics(self) -> dict[str, object]:
@@ -66,7 +66,7 @@ class RelayViews:
         )
 
     def _topics(self) -> Iterator[str]:
-        """The same as `topics`, a row at a time; each link is read at once, so that its counters add up."""
+        """The same as `topics`, a row at a time: of each link and topic the counters add up."""
         hub = self._hub
         yield '{"announced": '
         yield from table(announced_summary(hub.streams.announced()).items())

@@ -2,11 +2,10 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict
-from typing import Any, NamedTuple
+from typing import Any
 
 from sern_core.link.link import Link
-from sern_core.link.view import CodecView, Held
-from sern_core.link.view import TopicView as Open
+from sern_core.link.view import CodecView
 from sern_core.objects.changes import OBJECTS_TOPIC
 from sern_core.vocabulary.ledger import NO_DROPS, ReceiveCounters, ReceiveLedger
 from sern_core.vocabulary.message import StreamInfo
@@ -16,91 +15,46 @@ TopicView = dict[str, Any]
 """The counters of one topic, as `json.dumps` takes them."""
 
 
-class _Sent(NamedTuple):
-    """What a row of `link_rows` is made of, as it was when the link was looked at."""
-
-    topic: str
-    priority: int
-    wanted: bool
-    answered: bool
-    max_rate_hz: float | None
-    thinned: int
-    offered: int
-    delivered: int
-    dropped: int
-    reasons: Mapping[DropReason, int]
-    refused: int
-    held: Held
-    offered_bytes: int
-    delivered_bytes: int
-    codec: CodecView | None
-
-
 def link_summary(link: Link, *, direction: str) -> dict[str, TopicView]:
     """What was offered to a link and what became of it: offered = delivered + dropped + in_queue + in_flight."""
     return dict(link_rows(link, direction=direction))
 
 
 def link_rows(link: Link, *, direction: str) -> Iterator[tuple[str, TopicView]]:
-    """The same, each row made when it is asked for: the link is looked at when the first is, and 2,000 topics take
-    some milliseconds then. `answered`: the peer has said whether it wants it; `thinned`: left out for a share that the
-    adaptation has set."""
-    for sent in _look(link):
+    """The same, each row made when it is asked for. `answered`: the peer has said whether it wants it; `thinned`: left
+    out for a share that the adaptation has set."""
+    for counters, streams, held in link.each_topic():
+        if counters.topic == OBJECTS_TOPIC:
+            continue  # is nobody's topic; the metrics have it
+        newest = streams[-1] if streams else None
         yield (
-            sent.topic,
+            counters.topic,
             {
-                "class": CLASS_LABELS[sent.priority],
+                "class": CLASS_LABELS[counters.priority],
                 "direction": direction,
-                "wanted": sent.wanted,
-                "answered": sent.answered,
-                "max_rate_hz": sent.max_rate_hz,
-                "offered": sent.offered,
-                "sent": sent.offered - sent.dropped - sent.held.queued,
-                "delivered": sent.delivered,
-                "dropped": {str(reason): n for reason, n in sent.reasons.items() if n and reason != "refused"},
-                "refused": sent.refused,
-                "thinned": sent.thinned,
-                "in_queue": sent.held.queued,
-                "in_flight": sent.held.in_flight,
-                "bytes_offered": sent.offered_bytes,
-                "bytes_delivered": sent.delivered_bytes,
-                **_codec_view(sent.codec),
+                "wanted": any(stream.wanted for stream in streams),
+                "answered": any(stream.wanted is not None for stream in streams),
+                "max_rate_hz": None if newest is None else newest.spec.max_rate_hz,
+                "offered": counters.offered,
+                "sent": counters.offered - counters.dropped - held.queued,
+                "delivered": counters.delivered,
+                "dropped": _dropped(counters.by_reason),
+                "refused": counters.refused,
+                "thinned": sum(stream.thinned for stream in streams),
+                "in_queue": held.queued,
+                "in_flight": held.in_flight,
+                "bytes_offered": counters.offered_bytes,
+                "bytes_delivered": counters.delivered_bytes,
+                **_codec_view(None if newest is None else newest.codec),
             },
         )
 
 
-def _look(link: Link) -> list[_Sent]:
-    held = link.held()
-    open_now: dict[str, list[Open]] = {}
-    for view in link.topics():
-        open_now.setdefault(view.stream.id.topic, []).append(view)
-    nothing = Held(0, 0)
-    found = []
-    for topic, counters in link.counters.items():
-        if topic == OBJECTS_TOPIC:
-            continue  # is nobody's topic; the metrics have it
-        views = open_now.get(topic, ())
-        by_reason = counters.by_reason
-        found.append(
-            _Sent(
-                topic,
-                counters.priority,
-                any(view.wanted for view in views),
-                any(view.wanted is not None for view in views),
-                views[-1].spec.max_rate_hz if views else None,
-                sum(view.thinned for view in views),
-                counters.offered,
-                counters.delivered,
-                counters.dropped,
-                {} if by_reason is NO_DROPS else dict(by_reason),
-                counters.refused,
-                held.get(topic, nothing),
-                counters.offered_bytes,
-                counters.delivered_bytes,
-                views[-1].codec if views else None,
-            )
-        )
-    return found
+def _dropped(by_reason: Mapping[DropReason, int]) -> dict[str, int]:
+    """What was dropped, by reason. Refused messages were not offered, and are counted apart."""
+    if by_reason is NO_DROPS:
+        return {}
+    return {str(reason): count for reason, count in by_reason.items() if count and reason is not DropReason.REFUSED}
 
 
 def _codec_view(codec: CodecView | None) -> TopicView:
@@ -150,13 +104,12 @@ def received_rows(received: ReceiveLedger, *, now: float) -> Iterator[tuple[str,
 
 
 def _arrived(counters: ReceiveCounters, now: float) -> TopicView:
-    by_reason = counters.by_reason
     return {
         "class": CLASS_LABELS[counters.priority],
         "direction": "receive",
         "delivered": counters.delivered,
         "bytes_delivered": counters.delivered_bytes,
-        "dropped": {} if by_reason is NO_DROPS else {str(reason): n for reason, n in by_reason.items() if n},
+        "dropped": _dropped(counters.by_reason),
         "age_s": counters.age_of_information_s(now),
         "last_age_s": counters.age_s,
     }
@@ -171,11 +124,11 @@ def both_ways(link: Link, received: ReceiveLedger, *, now: float) -> dict[str, T
 
 
 def both_rows(link: Link, received: ReceiveLedger, *, now: float) -> Iterator[tuple[str, TopicView]]:
-    """The same, each row made when it is asked for. The link is looked at when the first is."""
+    """The same, each row made when it is asked for."""
     types: dict[str, str] = {}
     latched: set[str] = set()
     owners: dict[str, set[str]] = {}
-    for stream in (*(view.stream for view in link.topics()), *link.arriving()):
+    for stream in (*link.offered(), *link.arriving()):
         types.setdefault(stream.id.topic, stream.info.type_name)
         owners.setdefault(stream.id.topic, set()).add(stream.id.origin)
         if stream.spec.latched:

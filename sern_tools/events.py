@@ -68,7 +68,7 @@ class Follower:
             except SernError as error:
                 if lost_s is None:
                     lost_s = time.monotonic()
-                    self._warn(f"{error}; trying again")
+                    self._warn(f"{error} (trying again)")
                 yield None
                 self._pause(RETRY_S)
                 continue

@@ -48,7 +48,7 @@ class TopWatcher:
         except NotFoundError:
             raise SernError(f"{api}: the daemon is older than this program; update it, or use `sern topics`") from None
         try:
-            adaptation = get(api, "/api/mmcf")
+            adaptation = get(api, "/api/mmcf?last=1")
         except NotFoundError:
             adaptation = None
         return read(at_s, clients, get(api, "/api/link"), get(api, "/api/topics"), adaptation, events)

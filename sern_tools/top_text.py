@@ -260,8 +260,8 @@ def _block(line: TopicLine, columns: Iterable[tuple[str, int, int]], name_width:
     style = "" if line.level in ("ok", "note") else line.level
     name = f"{fit_end(line.topic, name_width):{name_width}}"
     room = width - CLASS - name_width - 1
-    if line.level == "note" and not line.hz and len(line.why) <= room:
-        return [[(name, "note"), (f" {line.why}", "note")]]
+    if line.level in ("note", "bad") and line.why and not line.hz and len(line.why) <= room:
+        return [[(name, line.level), (f" {line.why}", line.level)]]
     cells = _cells(line)
     numbers = "".join(f" {cells[label]:>{size}}" for label, size, _from in columns)
     first: Line = [(name, style), (numbers, style)]

@@ -116,7 +116,7 @@ class _Situation:
         self._sample = sample
         self._clients = {line.peer: line for line in (links if sample.relay else peers)}
         own = None if sample.relay or not links else links[0]
-        self._down = "" if own is None or own.state == "connected" else own.why or own.state
+        self._down = own is not None and own.state != "connected"
         row: Mapping[str, Any] = {} if sample.relay or not sample.links else sample.links[0]
         self._refused: Mapping[str, str] = row.get("refused", {})
         self._denied: list[str] = row.get("subscriptions_refused", [])
@@ -142,7 +142,7 @@ class _Situation:
         if name in self._refused:
             return BAD, f"access denied: {self._refused[name]}"
         if self._down:
-            return BAD, f"no link: {self._down}"
+            return BAD, "there is no link to the relay"
         if not flow.offered:
             return NOTE, "nothing was published yet"
         if not flow.answered:
@@ -188,7 +188,7 @@ class _Situation:
 
     def _arrives(self, flow: Flow, changed: Change) -> Word:
         if self._down:
-            return BAD, f"no link: {self._down}"
+            return BAD, "there is no link to the relay"
         gone = self._gone(flow.owners)
         if gone:
             return BAD, gone
@@ -225,15 +225,14 @@ class _Situation:
         return self._still(flow, changed)
 
     def _gone(self, owners: tuple[str, ...]) -> str:
-        """In words, that all who publish it are away; empty: they are not."""
+        """In words, that all who publish it are away; empty: they are not. Why is said once, beside the client."""
         lines = [self._clients.get(owner) for owner in owners]
         away = [line for line in lines if line is not None and line.state in AWAY]
         if not owners or len(away) < len(owners):
             return ""
         first = away[0]
         how_long = "" if first.since_s is None else f" for {_span(first.since_s)}"
-        word = "does not answer" if first.state == "silent" else f"is gone{how_long}"
-        return f"{first.peer} {word}" + (f": {first.why}" if first.why else "")
+        return f"{first.peer} " + ("does not answer" if first.state == "silent" else f"is gone{how_long}")
 
     # --- topics that there are not ----------------------------------------------------------------------------------
 
@@ -248,7 +247,7 @@ class _Situation:
             if denied is not None:
                 yield name, (BAD, f"access denied: {denied}")
             elif self._down:
-                yield name, (BAD, f"no link: {self._down}")
+                yield name, (BAD, "there is no link to the relay")
             elif gone := self._gone((owner,)):
                 yield name, (BAD, gone)
             elif owner == self._sample.name:

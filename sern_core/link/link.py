@@ -42,7 +42,7 @@ from sern_core.link.sender import Sender
 from sern_core.link.session import Session
 from sern_core.link.streams_in import StreamsIn
 from sern_core.link.streams_out import StreamsOut
-from sern_core.link.view import Held, LinkSettings, LinkView, Sending, TopicView, Undelivered
+from sern_core.link.view import Counted, Held, LinkSettings, LinkView, Sending, TopicView, Undelivered
 from sern_core.path.lanes import LANE_UDP, LANE_ZMQ, Lane
 from sern_core.stream.in_stream import Reassembly
 from sern_core.stream.out_channel import OutChannel
@@ -393,6 +393,20 @@ class Link:
     def held(self) -> dict[TopicName, Held]:
         """Messages that wait and that are in flight, by the topic of the stream. Looks at every message."""
         return view.held(self.sender.channels.values())
+
+    def each_topic(self) -> Iterator[Counted]:
+        """Every topic that is counted, each looked at when it is asked for: it adds up by itself."""
+        by_topic: dict[TopicName, list[OutChannel]] = {}
+        for channel in self.sender.channels.values():
+            by_topic.setdefault(channel.stream.id.topic, []).append(channel)
+        for topic, counters in tuple(self.counters.items()):
+            channels = by_topic.get(topic, [])
+            held = view.held(channels).get(topic)
+            yield Counted(counters, view.topics(channels), Held(0, 0) if held is None else held)
+
+    def offered(self) -> list[StreamInfo]:
+        """Our streams that are open towards the peer."""
+        return [channel.stream for channel in self.sender.channels.values()]
 
     def undelivered(self) -> Iterator[Undelivered]:
         """Every message that the peer is not known to have."""
