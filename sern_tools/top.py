@@ -18,7 +18,7 @@ import typer
 from sern_core.vocabulary.errors import SernError
 from sern_tools.api import NotFoundError, checked_api, drop_output, get_json, local_api, say
 from sern_tools.terminal import EndedError, Terminal
-from sern_tools.top_state import Sample, View, read
+from sern_tools.top_state import EVENTS, Sample, View, read
 from sern_tools.top_text import in_colour, screen
 from sern_tools.top_why import view
 from sern_tools.topics import MIN_INTERVAL_S
@@ -38,20 +38,26 @@ class TopWatcher:
         self.api = api
         self._get = get
         self._clock = clock
+        self._events: deque[Any] = deque(maxlen=EVENTS)
+        self._boot, self._after = "", 0
         self._samples = deque([self._look()])
 
     def _look(self) -> Sample:
         get, api, at_s = self._get, self.api, self._clock()
         try:
             clients = get(api, "/api/clients")
-            events = get(api, "/api/events")["events"]
+            told = get(api, f"/api/events?after={self._after}&boot={self._boot}")
         except NotFoundError:
             raise SernError(f"{api}: the daemon is older than this program; update it, or use `sern topics`") from None
+        if told["boot"] != self._boot:
+            self._events.clear()  # of another process
+        self._boot, self._after = told["boot"], told["last"]
+        self._events.extend(told["events"])
         try:
             adaptation = get(api, "/api/mmcf?last=1")
         except NotFoundError:
             adaptation = None
-        return read(at_s, clients, get(api, "/api/link"), get(api, "/api/topics"), adaptation, events)
+        return read(at_s, clients, get(api, "/api/link"), get(api, "/api/topics"), adaptation, tuple(self._events))
 
     def view(self) -> View:
         """What changed within the last `WINDOW_S`, so that a topic of 1 Hz does not flicker; or since the call before.

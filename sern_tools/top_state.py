@@ -163,7 +163,7 @@ def read(
         links,
         clients["clients"],
         adaptation,
-        tuple(events)[-EVENTS:],
+        tuple(events),
         clients["refused_total"],
     )
 

@@ -13,6 +13,7 @@ from sern_tools.explain_story import rate
 from sern_tools.top_state import LinkLine, TopicLine, View, class_order
 
 MIN_WIDTH: Final = 20
+"""What is laid out for less is cut."""
 Piece = tuple[str, str]
 """Text, and its style: a key of `CODES`, or empty."""
 Line = list[Piece]
@@ -105,7 +106,7 @@ def in_colour(line: Line, *, colour: bool) -> str:
 
 def screen(view: View, width: int, height: int | None = None, *, api: str = "", problem: str = "") -> list[Line]:
     """All of it: at most `height` lines of at most `width` columns. `problem`: why it is not of now."""
-    width = max(width, MIN_WIDTH)
+    columns, width = width, max(width, MIN_WIDTH)
     top = [_title(view, width, api), *([[(problem, "bad")]] if problem else [])]
     top += _links(view) + _choices(view, width) + _peers(view, width)
     top += [[(f"{'! ' if level != 'note' else ''}{text}", level)] for level, text in view.notes]
@@ -115,7 +116,7 @@ def screen(view: View, width: int, height: int | None = None, *, api: str = "", 
     lines = [*top, *_topics(view.topics, width, room), *events]
     if height is not None and len(lines) > height:
         lines = lines[:height]
-    return [clipped(line, width) for line in lines]
+    return [clipped(line, columns) for line in lines]
 
 
 def _title(view: View, width: int, api: str) -> Line:
