@@ -23,7 +23,7 @@ from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.ledger import MAX_TOPICS
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo
 from sern_core.vocabulary.names import to_global
-from sern_core.vocabulary.types import DropReason, Encoding, TopicName
+from sern_core.vocabulary.types import CLASS_LABELS, DropReason, Encoding, TopicName
 from sern_runtime import clock
 
 CLOSED: Final = "it is offered to nobody: its channel is closed"
@@ -145,6 +145,10 @@ class Outbound:
             return
         outgoing = self._topics[info.name] = Outgoing(info.name, channel, subscription, source, sink)
         self._by_stream.update(dict.fromkeys(outgoing.streams, outgoing))
+        _log.info(
+            "offering %s (%s) as %s: class %s, %s", info.name, info.type_name, name,
+            CLASS_LABELS[channel.spec.priority], "reliable" if channel.spec.reliable else "best effort",
+        )  # fmt: skip
         self._site.kick()
 
     def topic_removed(self, name: TopicName) -> None:

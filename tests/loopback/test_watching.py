@@ -40,8 +40,9 @@ async def started(*words: str, before: tuple[str, ...] = (), **options: Any) -> 
         if process.returncode is None:
             process.kill()
         await process.wait()
-        transport: Any = process._transport
-        transport.close()
+        for stream in (process.stdout, process.stderr):  # what is left, and its end
+            if stream is not None:
+                await stream.read()
 
 
 async def said(*words: str) -> str:
