@@ -144,12 +144,14 @@ def _links(view: View) -> list[Line]:
 def _link(line: LinkLine, head: str, names: int) -> Line:
     pieces: Line = [(f"{head:5} ", "head"), (f"{fit(line.peer, names):{names}} ", "")]
     pieces.append((f"{line.state:9} ", UP.get(line.state, "")))
-    if line.state in ("connected", "silent"):
+    if line.state == "silent":
+        pieces.append((f"last heard {ago(line.heard_s)} ago  {line.lane or ''}", ""))
+    elif line.state == "connected":
         pieces.append((_load(line), ""))
         if line.round_trip_s is not None:
-            pieces.append((f"  rtt {1e3 * line.round_trip_s:.0f} ms", ""))
+            pieces.append((f"  rtt {1e3 * line.round_trip_s:.0f}ms", ""))
         if line.loss is not None:
-            pieces.append((f"  loss {100 * line.loss:.1f} %", "warn" if line.loss >= 0.05 else ""))
+            pieces.append((f"  loss {100 * line.loss:.1f}%", "warn" if line.loss >= 0.05 else ""))
         pieces.append((f"  {line.lane or ''}", ""))
         if line.waiting_bytes:
             pieces.append((f"  {count(line.waiting_bytes)}B wait", "dim"))

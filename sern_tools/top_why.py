@@ -141,14 +141,14 @@ class _Situation:
     def _sent(self, name: str, flow: Flow, changed: Change) -> Word:
         if name in self._refused:
             return BAD, f"access denied: {self._refused[name]}"
-        if self._down:
-            return BAD, "there is no link to the relay"
         if not flow.offered:
             return NOTE, "nothing was published yet"
+        if flow.answered and not flow.wanted:
+            return NOTE, "nobody subscribes to it"
+        if self._down:
+            return BAD, "there is no link to the relay"
         if not flow.answered:
             return WARN, "waits for the relay to say whether anybody wants it"
-        if not flow.wanted:
-            return NOTE, "nobody subscribes to it"
         found = self._dropped(flow, changed)
         item = self._summaries.get(name)
         if item is not None:

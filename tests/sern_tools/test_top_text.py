@@ -55,7 +55,7 @@ def test_at_80_columns_it_is_exactly_this() -> None:
     lines = text(screen(view(ODOM, POINTS, CAMERA, events=(event,)), 80, 24, api=API))
     assert lines == [
         "client jackal1 at 127.0.0.1:5581                                       12:34:56Z",
-        "link  relay connected 1.42 of 1.5 Mbit/s  rtt 90 ms  loss 0.1 %  udp  147kB wait",
+        "link  relay connected 1.42 of 1.5 Mbit/s  rtt 90ms  loss 0.1%  udp  147kB wait",
         "conf  let in: bulk 50%; compressed: zstd (costs 0.21 in place of 0.40)",
         "class   topic                                        Hz   B/s   age drop/s drops",
         "control /jackal1/odom                              50.0   36k  0.1s",
@@ -110,6 +110,11 @@ def test_no_link_says_why() -> None:
     down = link(state="away", why="the relay does not answer: connecting failed", round_trip_s=None)
     lines = text(screen(view(links=(down,)), 80))
     assert lines[1] == "link  relay away      for 12s  the relay does not answer: connecting failed"
+
+
+def test_a_silent_link_says_when_it_was_last_heard() -> None:
+    lines = text(screen(view(links=(link(state="silent", why="no acknowledgement comes", heard_s=7.2),)), 80))
+    assert lines[1] == "link  relay silent    last heard 7.2s ago  udp  no acknowledgement comes"
 
 
 def test_without_colour_nothing_is_escaped() -> None:
