@@ -40,7 +40,9 @@ class ClientsWatcher:
         try:
             return self._clock(), self._get(self.api, PATH)
         except NotFoundError:
-            raise SernError(f"{self.api}: the daemon is older than this program and lists no clients") from None
+            raise SernError(
+                f"{self.api}: the daemon is older than this program, or of another kind, and lists no clients"
+            ) from None
 
     def answer(self) -> dict[str, Any]:
         """What the daemon says, with a rate beside each total: what changed since the call before."""

@@ -54,7 +54,9 @@ class Follower:
         try:
             answer = self._get(self._api, PATH)
         except NotFoundError:
-            raise SernError(f"{self._api}: the daemon is older than this program and tells no events") from None
+            raise SernError(
+                f"{self._api}: the daemon is older than this program, or of another kind, and tells no events"
+            ) from None
         self._boot, self._after = answer["boot"], answer["last"]
         return list(answer["events"][-last:]) if last else []
 

@@ -48,7 +48,7 @@ class TopWatcher:
             clients = get(api, "/api/clients")
             told = get(api, f"/api/events?after={self._after}&boot={self._boot}")
         except NotFoundError:
-            raise SernError(f"{api}: the daemon is older than this program; update it, or use `sern topics`") from None
+            raise SernError(f"{api}: the daemon is older than this program, or of another kind") from None
         if told["boot"] != self._boot:
             self._events.clear()  # of another process
         self._boot, self._after = told["boot"], told["last"]
