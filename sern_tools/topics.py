@@ -219,11 +219,11 @@ class Watcher:
 
 
 def _why(row: Row) -> str:
-    return " ".join(
-        f"{reason} {count}"
-        + (f" ({row.dropped_hz_by_reason[reason]:.1f}/s)" if reason in row.dropped_hz_by_reason else "")
-        for reason, count in list(row.dropped_by_reason.items())[:3]
-    )
+    return " ".join(f"{reason} {count}" for reason, count in list(row.dropped_by_reason.items())[:3])
+
+
+def _why_now(row: Row) -> str:
+    return " ".join(f"{reason} {hz:.1f}/s" for reason, hz in list(row.dropped_hz_by_reason.items())[:3])
 
 
 class Column(NamedTuple):
@@ -257,6 +257,7 @@ COLUMNS: Final = (
     Column("drops", lambda row: str(row.dropped or "")),
     Column("drop/s", lambda row: f"{row.dropped_hz:.1f}" if row.dropped_hz else ""),
     Column("why", _why, 100, number=False),
+    Column("now", _why_now, 170, number=False),
 )
 
 

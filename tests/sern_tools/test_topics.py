@@ -180,7 +180,8 @@ def test_a_narrow_terminal_keeps_what_matters_most() -> None:
     rows = compare({}, parse_topics(relay_view(1)), 1.0, parse_identities(OBJECTS))
     wide, middle, narrow = (text_of(rows, width) for width in (200, 120, 80))
     assert "nav_msgs/msg/Odometry" in wide
-    assert "superseded 2 (2.0/s) lifespan 1 (1.0/s)" in wide
+    assert "superseded 2 lifespan 1" in wide
+    assert "superseded 2.0/s lifespan 1.0/s" in wide
     assert "Odometry" not in middle
     assert "owner" in middle
     assert "owner" not in narrow
