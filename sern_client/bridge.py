@@ -83,6 +83,7 @@ class Bridge:
 
     def link_up(self, *, resumed: bool) -> None:
         self.rejected_reason = None
+        self.outbound.refused.clear()  # everything is announced anew
         _log.info("connected to %s%s", self.core.link.peer, " again" if resumed else "")
         self._shell.link_up()
 
@@ -91,8 +92,13 @@ class Bridge:
 
     def rejected(self, code: str, text: str) -> None:
         # It is asked again every few seconds; of a session that was taken from us `link_down` has said it.
-        if text != self.rejected_reason and code != DISPLACED:
-            _log.error("the relay refuses us (%s): %s", code, text)
+        if text != self.rejected_reason:
+            peer = self.core.link.peer
+            if code == DISPLACED:
+                self.site.events.add("takeover", peer, text, code=code)
+            else:
+                words = "the relay refuses us (%s): %s"
+                self.site.events.say(_log, logging.ERROR, "refused", peer, words, code, text, code=code)
         self.rejected_reason = text
 
     def lane_offered(self, parameters: framing.Envelope) -> None:

@@ -34,13 +34,13 @@ from sern_client.factory import local_encoding, make_endpoint, make_link_topics
 from sern_client.guard import Guard
 from sern_client.link_news import SILENT, LinkNews
 from sern_client.link_state import LinkState
-from sern_client.objects_view import objects_view
 from sern_client.on_demand import OnDemand
 from sern_client.scene.making import make_scene
 from sern_client.services import ServiceBridge
 from sern_client.site import Site
 from sern_client.site_objects import CoreObjects
 from sern_client.tables import Tables
+from sern_client.views import ClientViews
 from sern_core.bodies.lossy import missing
 from sern_core.objects.feed import PERIOD_S
 from sern_core.site.client import ClientCore, ClientEvents
@@ -60,6 +60,7 @@ from sern_runtime.config.load import Loaded
 from sern_runtime.durable.keeper import Keeper, Stored
 from sern_runtime.durable.store import Store
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
+from sern_runtime.events import EventLog
 from sern_runtime.http_routes import Health
 from sern_runtime.internal_errors import InternalErrors
 from sern_runtime.loop import Shutdown
@@ -68,7 +69,6 @@ from sern_runtime.metrics import Metrics
 from sern_runtime.optional import OptionalParts
 from sern_runtime.sdnotify import Notifier, Watchdog
 from sern_runtime.topics_view import TopicView, both_ways
-from sern_runtime.trace_view import of_client, trace_view
 from sern_runtime.transport_watch import NOT_YET, WAITING
 
 if TYPE_CHECKING:
@@ -111,6 +111,7 @@ class ClientDaemon:
             "adaptation", "codecs", "frames", "http", "link_state", "message_log", "metrics", "scene", "summaries"
         )
         self.message_log = MessageLog(loaded.resolve(model.message_log)) if model.message_log else None
+        self.events = EventLog()
         self.site = Site(
             endpoint,
             model.rules(),
@@ -119,6 +120,7 @@ class ClientDaemon:
             frame_prefix=model.client.frame_prefix,
             log=self.message_log,
             parts=self.parts,
+            events=self.events,
         )
         discovery = model.discovery.filter()
         now = clock.now()
@@ -146,7 +148,7 @@ class ClientDaemon:
         self.scene = make_scene(loaded, endpoint, self.site, objects, local_encoding(model))
         self.on_demand = self._make_on_demand(endpoint, objects)
         self.adaptation = self._make_adaptation()
-        self.news = LinkNews(self.core.link, model.relay.endpoint)
+        self.news = LinkNews(self.core.link, model.relay.endpoint, self.events)
         self.link_state = LinkState(
             self.core,
             make_link_topics(model, self.site.advertise),
@@ -155,6 +157,10 @@ class ClientDaemon:
             withdraw_after_s=state.withdraw_after_s,
             reason=self.why,
             parts=self.parts,
+            events=self.events,
+        )
+        self.views = ClientViews(
+            model.name, self.bridge, self.news, self.link_state, self.events, reason=self.why, address=self._address
         )
         if isinstance(endpoint, ShowingEndpoint):
             endpoint.show_link(self.link_words)
@@ -291,7 +297,8 @@ class ClientDaemon:
             kept = self.parts.keep("adaptation", self.adaptation.run, reset=self.adaptation.reset)
             self.tasks.append(asyncio.create_task(kept, name="adaptation"))
         self.notifier.ready(f"{model.name} -> {relay.endpoint}")
-        _log.info("client %s started, relay %s", model.name, relay.endpoint)
+        words = "client %s started, relay %s"
+        self.events.say(_log, logging.INFO, "started", "", words, model.name, relay.endpoint)
 
     def _kick(self) -> None:
         self.connection.wake()
@@ -335,6 +342,7 @@ class ClientDaemon:
             if watchdog.interval_s is not None:
                 watchdog.check()
             self.news.look()
+            self.events.tick()
             link = self.core.link
             state = "up" if link.established and not link.lane.stalled else f"down: {self.why()}"
             self.notifier.status(f"link {state}")
@@ -356,6 +364,11 @@ class ClientDaemon:
         if self.news.reason == NOT_YET and self.connection.waiting:
             return f"{WAITING}{where}"
         return unresolved or self.bridge.rejected_reason or f"{self.news.reason}{where}"
+
+    def _address(self) -> str:
+        """Where the relay is: its address in the file, and what that stands for, where it is a name."""
+        name = self.connection.name
+        return self.loaded.model.relay.endpoint + (f" ({name.at})" if name is not None and name.at else "")
 
     def _put_node(self) -> None:
         """Tell the relay's registry who we are."""
@@ -402,23 +415,13 @@ class ClientDaemon:
             health=lambda: Health(ok=True, reason="running"),
             ready=self.readiness,
             json_routes={
-                "/api/link": self._link_view,
-                "/api/site_objects": objects_view(self.core),
-                "/api/peers": self.link_state.to_json,
-                "/api/topics": self.topics,
-                "/api/trace": trace_view(of_client(self.core.link, self.core.trace), clock.now),
-                "/api/values": self.site.values.view(),
+                **self.views.routes(),
                 **({} if self.scene is None else {"/api/scene": self.scene.to_json}),
-                **({} if adaptation is None else {"/api/mmcf": adaptation.to_json}),
+                **({} if adaptation is None else {"/api/mmcf": adaptation.view()}),
                 **(self.site.endpoint.json_routes if isinstance(self.site.endpoint, ServedEndpoint) else {}),
             },
             parts=self.parts,
         )
-
-    def _link_view(self) -> list[dict[str, object]]:
-        now = clock.now()
-        summaries = self.bridge.outbound.summaries.to_json(now)
-        return [{**self.core.link.snapshot(), "summaries": summaries, "now_s": now}]
 
     def link_words(self) -> str:
         """How the link is, for people: /readyz with the time there and back."""
@@ -482,6 +485,7 @@ class ClientDaemon:
                 stack.callback(self._ctx.destroy, linger=0)
             if self._http is not None:
                 stack.push_async_callback(self._http.stop)
+            stack.callback(self.events.close)
             if self._endpoint_started:
                 stack.push_async_callback(self.site.endpoint.stop)
             if self.guard is not None:

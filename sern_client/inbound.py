@@ -363,7 +363,8 @@ class Inbound:
     def subscription_refused(self, code: str, text: str) -> None:
         """The relay does not let us have something that we asked for. Said once, as it is told in every session."""
         if text not in self.subscription_problems:
-            _log.error("the relay refuses a subscription (%s): %s", code, text)
+            words = "the relay refuses a subscription (%s): %s"
+            self._site.events.say(_log, logging.ERROR, "denied", "", words, code, text, code=code)
             if len(self.subscription_problems) < MAX_PROBLEMS:
                 self.subscription_problems[text] = code
 
@@ -422,5 +423,8 @@ class Inbound:
                 if first:
                     self.leases_fired += 1
                     self._core.lease_expired(stream, lease.after_s, now=now)
-                    _log.warning("%s: no fresh command; publishing the stop command", incoming.local)
+                    self._site.events.say(
+                        _log, logging.WARNING, "command_stopped", incoming.local,
+                        "%s: no fresh command; publishing the stop command", incoming.local, after_s=lease.after_s,
+                    )  # fmt: skip
         self._arm()

@@ -1,4 +1,5 @@
-"""Says in the log when the relay is lost, silent, and there again: each loss once, its end with how long it took."""
+"""Says in the log, and as events, when the relay is lost, silent, and there again: each loss once, its end with how
+long it took; and keeps since when it has been so."""
 
 import logging
 from typing import Final
@@ -6,6 +7,7 @@ from typing import Final
 from sern_core.link.handshake import NEW_SESSION
 from sern_core.link.link import Link
 from sern_runtime import clock
+from sern_runtime.events import EventLog
 from sern_runtime.outages import Outages
 from sern_runtime.transport_watch import NOT_YET
 
@@ -17,16 +19,21 @@ _log = logging.getLogger(__name__)
 class LinkNews:
     """Is told what becomes of `link`; `relay` is its address, as a person knows it."""
 
-    def __init__(self, link: Link, relay: str) -> None:
+    def __init__(self, link: Link, relay: str, events: EventLog | None = None) -> None:
+        self._events = events or EventLog()
         self.reason = NOT_YET
         """Why the link was last down, in words."""
         self.said: set[str] = set()
         """Reasons that were said since the last session: an attempt that fails as before is no news."""
-        self.outages = Outages(_log, logging.WARNING)
+        self.outages = Outages(_log, logging.WARNING, events=self._events)
+        self.since_s: float | None = None
+        """Since when there has been a session, or none after one; None: there never was one."""
+        self.sessions = 0
         self._link = link
         self._relay = relay
         self._down_since_s = clock.now()
         self._stopping = False
+        self._up = False
 
     def stopping(self) -> None:
         """What ends from now on ends because we do."""
@@ -39,6 +46,8 @@ class LinkNews:
         if not link.established:  # else the session goes on over the other lane
             silent_since_s = self.outages.since_s(link.peer)
             self.outages.forget(link.peer)
+            if self._up:
+                self._up, self.since_s = False, clock.now()
         if self._stopping:
             return
         if not self.said:
@@ -48,12 +57,23 @@ class LinkNews:
         if reason not in self.said:
             self.said.add(reason)
             then = "" if reason == NEW_SESSION else "; trying again until it works"
-            _log.warning("%s: %s%s", self._relay, reason, then)
+            self._events.say(
+                _log, logging.WARNING, "lost", link.peer, "%s: %s%s", self._relay, reason, then, reason=reason
+            )
 
     def up(self) -> None:
         """A session has begun."""
+        self.sessions += 1
+        now = self.since_s = clock.now()
+        self._up = True
         if self.said:  # in the words and at the level of the loss
-            _log.warning("%s: the link is there again, after %.0f s", self._relay, clock.now() - self._down_since_s)
+            away_s = now - self._down_since_s
+            words = "%s: the link is there again, after %.0f s"
+            self._events.say(
+                _log, logging.WARNING, "connected", self._link.peer, words, self._relay, away_s, away_s=away_s
+            )
+        else:
+            self._events.add("connected", self._link.peer, f"{self._relay}: connected")
         self.said.clear()
 
     def look(self) -> None:
@@ -63,7 +83,9 @@ class LinkNews:
             return
         if self.said and link.handshake.transport_up:  # a session that outlived its connection has another now
             self.said.clear()
-            _log.warning("%s: the connection is there again, after %.0f s", self._relay, now - self._down_since_s)
+            away_s = now - self._down_since_s
+            words = "%s: the connection is there again, after %.0f s"
+            self._events.say(_log, logging.WARNING, "connection", link.peer, words, self._relay, away_s, away_s=away_s)
         self.outages.look(
             link.peer, lost=link.lane.stalled, now=now,
             gone=f"{self._relay}: {SILENT}", back=f"{self._relay}: the relay answers again",

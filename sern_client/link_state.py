@@ -15,6 +15,7 @@ from sern_core.site.client import ClientCore
 from sern_core.site.peers import MAX_PEERS, PeerChange, PeerStatus, PeerView
 from sern_core.vocabulary.types import ClientName, TopicName
 from sern_runtime import clock
+from sern_runtime.events import EventLog
 from sern_runtime.loop import Timer
 from sern_runtime.metrics import Metrics
 from sern_runtime.optional import OptionalParts
@@ -48,7 +49,9 @@ class LinkState:
         withdraw_after_s: float | None,
         reason: Callable[[], str],
         parts: OptionalParts,
+        events: EventLog | None = None,
     ) -> None:
+        self._events = events or EventLog()
         self._core = core
         self._topics = topics
         self._withdrawal = withdrawal
@@ -103,12 +106,14 @@ class LinkState:
         if change.forgotten:
             gone_s = self._gone_s.pop(name, None)
             if gone_s is not None:
-                _log.warning(
+                self._events.say(
+                    _log, logging.WARNING, "peer_forgotten", name,
                     "%s is forgotten after %.1f s: it has nothing that is wanted here, as far as the relay says",
                     name, now - gone_s,
                 )  # fmt: skip
         elif change.given_up:
-            _log.warning(
+            self._events.say(
+                _log, logging.WARNING, "peer_given_up", name,
                 "%s is given up by the relay after %.0f s: its topics end, and it is gone until it is back",
                 name, change.lasted_s,
             )  # fmt: skip
@@ -116,13 +121,16 @@ class LinkState:
             while len(self._gone_s) >= MAX_PEERS:
                 del self._gone_s[next(iter(self._gone_s))]
             self._gone_s[name] = now
-            _log.warning("%s is gone: the relay does not reach it any more", name)
+            words = "%s is gone: the relay does not reach it any more"
+            self._events.say(_log, logging.WARNING, "peer_gone", name, words, name)
         elif change.new is PeerStatus.CONNECTED:
             gone_s = self._gone_s.pop(name, None)
             if gone_s is not None:
-                _log.warning("%s is back after %.1f s", name, now - gone_s)
+                away_s = now - gone_s
+                words = "%s is back after %.1f s"
+                self._events.say(_log, logging.WARNING, "peer_back", name, words, name, away_s, away_s=away_s)
             elif name not in self._there:
-                _log.info("%s is there", name)
+                self._events.say(_log, logging.INFO, "peer_there", name, "%s is there", name)
             self._there.add(name)
 
     def _due(self) -> None:

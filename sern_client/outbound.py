@@ -25,7 +25,7 @@ from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.ledger import MAX_TOPICS
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo
 from sern_core.vocabulary.names import to_global
-from sern_core.vocabulary.types import DropReason, Encoding, TopicName
+from sern_core.vocabulary.types import CLASS_LABELS, DropReason, Encoding, TopicName
 from sern_runtime import clock
 
 CLOSED: Final = "it is offered to nobody: its channel is closed"
@@ -71,6 +71,8 @@ class Outbound:
     ) -> None:
         self.refusals = 0
         """Publications that the relay did not take."""
+        self.refused: dict[TopicName, str] = {}
+        """Those of the session, by global name, in the relay's words."""
         self.reckoned = 0
         """Poses that were not sent, because whoever receives them is right without."""
         self.summaries = Summaries(self._sender, site.parts)
@@ -86,7 +88,8 @@ class Outbound:
         self._closed = False
         self._topics: dict[TopicName, Outgoing] = {}
         self._by_stream: dict[StreamId, Outgoing] = {}  # the same, by each stream it goes to
-        self._unnamed: set[TopicName] = set()  # local topics without a rule, of which it was said
+        self.unnamed: dict[TopicName, None] = {}
+        """Local topics that stay here because no rule names them, as far as that was said."""
 
     @property
     def streams(self) -> KeysView[StreamId]:
@@ -161,6 +164,10 @@ class Outbound:
             return
         outgoing = self._topics[info.name] = Outgoing(info.name, channel, subscription, source, sink)
         self._by_stream.update(dict.fromkeys(outgoing.streams, outgoing))
+        _log.info(
+            "offering %s (%s) as %s: class %s, %s", info.name, info.type_name, name,
+            CLASS_LABELS[channel.spec.priority], "reliable" if channel.spec.reliable else "best effort",
+        )  # fmt: skip
         self._site.kick()
 
     def topic_removed(self, name: TopicName) -> None:
@@ -178,8 +185,8 @@ class Outbound:
 
     def _say_unnamed(self, info: TopicInfo) -> None:
         """Said once for each name: a rule with a typing error looks like a robot without the topic."""
-        if info.name not in self._unnamed and len(self._unnamed) < MAX_TOPICS:
-            self._unnamed.add(info.name)
+        if info.name not in self.unnamed and len(self.unnamed) < MAX_TOPICS:
+            self.unnamed[info.name] = None
             _log.info("%s (%s) stays here: no rule in `topics` names it (discovery.mode: manual)", info.name,
                       info.type_name)  # fmt: skip
 
@@ -273,6 +280,8 @@ class Outbound:
 
     def wanted(self, stream: StreamInfo, wanted: bool) -> None:
         """Whether anybody at the far side wants a stream of ours."""
+        if wanted:
+            self.refused.pop(stream.id.topic, None)
         outgoing = self._by_stream.get(stream.id)
         if outgoing is None:
             return
@@ -308,7 +317,11 @@ class Outbound:
     def publication_refused(self, stream: StreamInfo, code: str, text: str) -> None:
         """The relay does not take a stream of ours."""
         self.refusals += 1
-        _log.error("the relay refuses %s (%s): %s", stream.id.topic, code, text)
+        topic = stream.id.topic
+        if len(self.refused) < MAX_TOPICS:
+            self.refused[topic] = text
+        words = "the relay refuses %s (%s): %s"
+        self._site.events.say(_log, logging.ERROR, "denied", topic, words, topic, code, text, code=code)
 
     # --- consistency ------------------------------------------------------------------------------------------------
 

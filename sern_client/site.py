@@ -8,6 +8,7 @@ from sern_client.frames import FramePrefixer
 from sern_client.latest import LatestValues
 from sern_core.topics.rules import RuleSet
 from sern_core.vocabulary.message import TopicInfo
+from sern_runtime.events import EventLog
 from sern_runtime.message_log import MessageLog
 from sern_runtime.optional import OptionalParts
 
@@ -25,6 +26,7 @@ class Site:
         frame_prefix: str | None = None,
         log: MessageLog | None = None,
         parts: OptionalParts | None = None,
+        events: EventLog | None = None,
     ) -> None:
         self.endpoint = endpoint
         self.rules = rules
@@ -32,6 +34,7 @@ class Site:
         self.kick = kick
         self.log = log
         self.parts = parts or OptionalParts()
+        self.events = events or EventLog()
         self.frames = FramePrefixer(frame_prefix)
         self.converter = endpoint.converter if isinstance(endpoint, HasConverter) else Converter()
         self.values = LatestValues()

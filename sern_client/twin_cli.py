@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sern_runtime import version
+from sern_runtime.logs import LOG_FORMAT_HELP, LogFormat
 
 if TYPE_CHECKING:
     from sern_runtime.config.shared import LogSection
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
 
 def command(
     config: Annotated[Path, typer.Option("--config", "-c", help="The file of the twins (YAML): endpoint kind twin.")],
+    log_format: Annotated[LogFormat | None, typer.Option("--log-format", help=LOG_FORMAT_HELP)] = None,
     _version: Annotated[
         bool, typer.Option("--version", callback=version.shown("sern-twin"), is_eager=True, help=version.HELP)
     ] = False,
@@ -36,7 +38,7 @@ def command(
             raise problem
         return model.log
 
-    raise typer.Exit(run_daemon("sern-twin", log, lambda shutdown: run_client(config, shutdown)))
+    raise typer.Exit(run_daemon("sern-twin", log, lambda shutdown: run_client(config, shutdown), log_format=log_format))
 
 
 def main() -> None:

@@ -29,6 +29,15 @@ class Admission:
         """Whether the name is in the directory."""
         return self.directory is None or client in self.directory.names
 
+    @property
+    def names(self) -> tuple[ClientName, ...]:
+        """The names in the directory; none where there is none."""
+        return () if self.directory is None else self.directory.names
+
+    def named(self, client: ClientName) -> bool:
+        """Whether there is a directory that has the name."""
+        return self.directory is not None and client in self.directory.names
+
     def status(self, client: ClientName, public_key: str) -> KeyStatus:
         """Whether what comes over a connection that was made with this key is taken: if it is VALID."""
         if self.directory is None:

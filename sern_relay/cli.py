@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sern_runtime import version
+from sern_runtime.logs import LOG_FORMAT_HELP, LogFormat
 
 if TYPE_CHECKING:
     from sern_runtime.config.shared import LogSection
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
 
 def command(
     config: Annotated[Path, typer.Option("--config", "-c", help="The relay's configuration file (YAML).")],
+    log_format: Annotated[LogFormat | None, typer.Option("--log-format", help=LOG_FORMAT_HELP)] = None,
     _version: Annotated[
         bool, typer.Option("--version", callback=version.shown("sern-relay"), is_eager=True, help=version.HELP)
     ] = False,
@@ -27,7 +29,7 @@ def command(
     def log() -> "LogSection":
         return load_relay(config).model.log
 
-    raise typer.Exit(run_daemon("sern-relay", log, lambda shutdown: run_relay(config, shutdown)))
+    raise typer.Exit(run_daemon("sern-relay", log, lambda shutdown: run_relay(config, shutdown), log_format=log_format))
 
 
 def main() -> None:

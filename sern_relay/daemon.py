@@ -26,14 +26,14 @@ from sern_relay.admission import ZAP_DOMAIN, Admission, read_directory
 from sern_relay.comings import Comings
 from sern_relay.durable import DurableHolding
 from sern_relay.feed import RelayFeed
-from sern_relay.objects_view import objects_view
 from sern_relay.readers import Readers
+from sern_relay.refusals import Refusals
 from sern_relay.relay_metrics import register_relay
 from sern_relay.reload_state import ReloadState
 from sern_relay.server import RelayServer
-from sern_relay.trace_source import of_hub
 from sern_relay.transforms import TransformObjects
 from sern_relay.udp import RelayLanes
+from sern_relay.views import RelayViews
 from sern_runtime import clock, ros_types
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.codec_pool import CodecPool, make_coder
@@ -46,6 +46,7 @@ from sern_runtime.draining import Progress
 from sern_runtime.durable.keeper import Keeper, Stored
 from sern_runtime.durable.store import Store
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
+from sern_runtime.events import EventLog
 from sern_runtime.http_routes import Health
 from sern_runtime.internal_errors import InternalErrors
 from sern_runtime.loop import Shutdown
@@ -53,8 +54,6 @@ from sern_runtime.message_log import LoggedFates, MessageLog
 from sern_runtime.metrics import Metrics
 from sern_runtime.optional import OptionalParts
 from sern_runtime.sdnotify import Notifier, Watchdog
-from sern_runtime.topics_view import announced_summary, link_summary, received_summary
-from sern_runtime.trace_view import trace_view
 from sern_runtime.zap import ZapHandler, self_test
 
 if TYPE_CHECKING:
@@ -108,6 +107,8 @@ class RelayDaemon:
         self.collector = CollectorWatch()
         self.refusals = dict.fromkeys((*sorted(REFUSAL_CODES), OTHER_CODE), 0)
         self.reloads = ReloadState()
+        self.events = EventLog()
+        self.turned_away = Refusals(self.events)
         self.hub = Hub(
             name=model.name,
             boot=secrets.randbits(63),
@@ -132,7 +133,10 @@ class RelayDaemon:
         self.codecs = CodecPool(after=self._after, parts=self.parts)
         self.coder = make_coder(model.link.params(), self.codecs)
         self.readers = Readers(self.coder, self.parts, self.errors)
-        self._comings = Comings()
+        self._comings = Comings(self.events, remembered=self.admission.named, address=self._address)
+        self.views = RelayViews(
+            model.name, self.hub, self._comings, self.turned_away, self.events, self.admission, self._address
+        )
         self.adaptation: Adaptation | None = None
         if model.adaptation is not None:
             with blamed_on(loaded.path, "adaptation"):
@@ -192,7 +196,7 @@ class RelayDaemon:
         self._ctx = zmq.Context()
         self.readers.transforms = TransformObjects(self.hub.objects, parts=self.parts)
         if keys is not None:
-            self.zap = ZapHandler(self._ctx)
+            self.zap = ZapHandler(self._ctx, refused=self.turned_away.refuse)
             self.zap.add_domain(ZAP_DOMAIN, self.admission.lookup)
         with blamed_on(self.loaded.path, "relay", "listen"):
             self.server = RelayServer(
@@ -208,6 +212,7 @@ class RelayDaemon:
                 redundancy=model.link.redundancy,
                 after=self._after,
                 marks=model.link.dscp.marks(),
+                turned_away=self.turned_away.note,
             )
         if keys is not None and relay.udp:
             with blamed_on(self.loaded.path, "relay", "listen"):
@@ -233,7 +238,9 @@ class RelayDaemon:
             self.tasks.append(asyncio.create_task(kept, name="adaptation"))
         self._ready = True
         self.notifier.ready(f"{model.name} on {', '.join(relay.listen)}")
-        _log.info("relay %s listens on %s", model.name, ", ".join(relay.listen))
+        self.events.say(
+            _log, logging.INFO, "started", "", "relay %s listens on %s", model.name, ", ".join(relay.listen)
+        )
 
     def _end_lapsed(self) -> None:
         """Cut the connections of every client of which a key was taken away or has expired; one with a key that still
@@ -243,7 +250,8 @@ class RelayDaemon:
             return
         self.server.cut_unbound()
         for client in lapsed:
-            _log.warning("%s lost a key; %d connections cut", client, self.server.cut_client(client))
+            cut = self.server.cut_client(client)
+            self.events.say(_log, logging.WARNING, "key_lost", client, "%s lost a key; %d connections cut", client, cut)
             self.hub.clients.end_session(client, "the key no longer holds", now=clock.now())
 
     def _after(self) -> None:
@@ -293,6 +301,7 @@ class RelayDaemon:
             if watchdog.interval_s is not None:
                 watchdog.check()
             self._comings.look(self.hub.links, now)
+            self.events.tick()
             self.notifier.status(self._status())
 
     async def _tell_objects(self) -> None:
@@ -309,6 +318,11 @@ class RelayDaemon:
         """What `/readyz` says."""
         return Health(ok=self._ready, reason=self.reloads.beside("listening" if self._ready else "starting"))
 
+    def _address(self, client: ClientName) -> str:
+        """Where a client comes from now; empty: it has no connection."""
+        by_tcp = self.server.address(client) if self.server is not None else ""
+        return by_tcp or (self.lanes.address(client) if self.lanes is not None else "")
+
     def clients_up(self) -> int:
         """Clients with a session."""
         return sum(link.established for link in self.hub.links.values())
@@ -322,7 +336,9 @@ class RelayDaemon:
             access = AccessTable(loaded.model.access_rules())
         except ConfigError as error:
             self.reloads.failed(str(error), now=clock.now())
-            _log.error("reload failed, the old configuration stays: %s", error)
+            self.events.say(
+                _log, logging.ERROR, "reload_failed", "", "reload failed, the old configuration stays: %s", error
+            )
             self.notifier.ready(self._status())
             return
         self.reloads.read()
@@ -336,12 +352,16 @@ class RelayDaemon:
             self.server.cut_unbound()  # admitted by the old keys, and silent so far
         self._end_lapsed()
         for client in [name for name in self.hub.links if not self.admission.known(name)]:
-            _log.warning("%s is in the directory no more; what was held for it is dropped", client)
+            self.events.say(
+                _log, logging.WARNING, "key_lost", client,
+                "%s is in the directory no more; what was held for it is dropped", client,
+            )  # fmt: skip
             self.hub.forget(client, "the name is revoked", now=now)
         self._after()
         self.notifier.ready(self._status())
         self._in_force(now)
-        _log.info("reloaded keys, access rules and feed roles; other changes need a restart")
+        words = "reloaded keys, access rules and feed roles; other changes need a restart"
+        self.events.say(_log, logging.INFO, "reloaded", "", words)
 
     def _in_force(self, now: float) -> None:
         failed_s = self.reloads.take_recovery_s(now=now)
@@ -353,7 +373,6 @@ class RelayDaemon:
 
         registry = CollectorRegistry()
         metrics = Metrics(registry)
-        adaptation = self.adaptation
         register_relay(metrics, self)
         metrics.counter("sern_http_refused_total", "Requests to the HTTP server that were none.",
                         read=lambda: [((), float(self._http.refused if self._http else 0))])  # fmt: skip
@@ -362,13 +381,7 @@ class RelayDaemon:
             registry,
             health=lambda: Health(ok=True, reason="running"),
             ready=self.readiness,
-            json_routes={
-                "/api/link": lambda: [{**link.snapshot(), "now_s": clock.now()} for link in self.hub.links.values()],
-                "/api/objects": objects_view(self.hub),
-                "/api/topics": self.topics,
-                "/api/trace": trace_view(of_hub(self.hub), clock.now),
-                **({} if adaptation is None else {"/api/mmcf": adaptation.to_json}),
-            },
+            json_routes=self.views.routes(self.adaptation),
             parts=self.parts,
         )
 
@@ -393,15 +406,6 @@ class RelayDaemon:
         if self.readers.feed is not None and self.readers.feed.feed.missing and self.readers.feed.open_missing():
             self.reloads.part_in_force()
             self._in_force(now)
-
-    def topics(self) -> dict[str, object]:
-        """Counters by client link and topic, and of what arrived; and what is announced, whether taken or not."""
-        now = clock.now()
-        return {
-            "announced": announced_summary(self.hub.streams.announced()),
-            "links": {name: link_summary(link, direction="send") for name, link in self.hub.links.items()},
-            "received": received_summary(self.hub.received, now=now),
-        }
 
     async def drain(self) -> None:
         """Go on with what connected clients have not confirmed while that gets anywhere, then end their sessions."""
@@ -451,6 +455,7 @@ class RelayDaemon:
                     stack.callback(part.close)
             if self._http is not None:
                 stack.push_async_callback(self._http.stop)
+            stack.callback(self.events.close)
             stack.callback(self.codecs.close)
             if self.durable is not None:
                 stack.callback(self.durable.close)
@@ -467,7 +472,7 @@ class RelayDaemon:
             return
         path = self.loaded.resolve(name)
         try:
-            path.write_text(json.dumps({"relay": self.loaded.model.name, **self.topics()}, indent=1) + "\n")
+            path.write_text(json.dumps({"relay": self.loaded.model.name, **self.views.topics()}, indent=1) + "\n")
         except OSError as error:
             _log.error("%s: the summary could not be written: %s", path, error.strerror)
 
@@ -503,4 +508,4 @@ class RelayDaemon:
 
     def refused(self, client: ClientName, code: str, text: str) -> None:
         self.refusals[code if code in REFUSAL_CODES else OTHER_CODE] += 1
-        _log.warning("%s: %s", client, text)
+        self._comings.refused(client, code, text)

@@ -47,7 +47,7 @@ class RelayServer:
 
     `key_status(name, key)` is asked when a connection first speaks: its key may not hold any more since it was let in.
     The key is that of its handshake, which the User-Id carries; empty without `keys`. `after` is called whenever
-    something came in.
+    something came in, `turned_away(address, key, why)` of each connection that ends before it is a client's.
     """
 
     def __init__(
@@ -65,8 +65,10 @@ class RelayServer:
         redundancy: Redundancy,
         after: Callable[[], None],
         marks: Marks | None = None,
+        turned_away: Callable[[str, str, str], None] = lambda _address, _key, _why: None,
     ) -> None:
         self.hub = hub
+        self._turned_away = turned_away
         self.bad_frames = 0
         self.revoked = 0
         """Connections that spoke first when their key was no longer known."""
@@ -89,7 +91,9 @@ class RelayServer:
             handshake_ivl_ms=int(handshake_interval_s * 1000),
             max_message_bytes=LANE_MESSAGE_BYTES,
         )
-        self.connections = ConnectionTable(raw, max_connections=max_connections, on_change=self._connections_changed)
+        self.connections = ConnectionTable(
+            raw, max_connections=max_connections, on_change=self._connections_changed, on_capped=self._capped
+        )
         self.clients = ClientConnections(self.connections)
         """Those of them on which a client has spoken."""
         self.priority_lanes = RelayPriorityLanes(hub, self.clients, self._send, redundancy, after=after)
@@ -133,7 +137,12 @@ class RelayServer:
         """What no SERN client sends: the message is dropped and counted, and the connection closed."""
         details = self.socket.peer_details()
         _log.warning("connection from %s closed: %s", details.address, why)
+        self._turned_away(details.address, "", why)
         self.connections.cut(details.fd)
+
+    def _capped(self, source: str) -> None:
+        _log.warning("connection from %s cut: there are as many as may be (max_connections, or half-open ones)", source)
+        self._turned_away(source, "", "as many connections as may be")
 
     def _endless(self, handle: TcpHandle) -> None:
         connection = self.connections.by_fd(handle.fd)
@@ -150,12 +159,14 @@ class RelayServer:
         except (WireError, UsageError) as error:
             self.bad_frames += 1
             _log.warning("connection from %s closed: bad frame: %s", details.address, error)
+            self._turned_away(details.address, "", f"bad frame: {error}")
             self.connections.cut(details.fd)
             return None
         status = self._key_status(name, key)
         if status is not KeyStatus.VALID:
             self.revoked += 1
             _log.warning("connection from %s closed: the key of %s %s", details.address, name, REFUSED_KEY[status])
+            self._turned_away(details.address, key, f"the key of {name} {REFUSED_KEY[status]}")
             self.connections.cut(details.fd)
             return None
         self.connections.bind_user(details.fd, name)
@@ -242,6 +253,15 @@ class RelayServer:
             if connection.client == client and served.port.current:
                 return None if connection.handle is None else connection.handle.local[1]
         return None
+
+    def address(self, client: ClientName) -> str:
+        """Where the client's session comes from by TCP; empty while it has no such connection."""
+        port = self.hub.clients.port_of.get(client)
+        if port is not None:
+            return port.address
+        # A session is told of before it has its connection: that is then the newest of the client.
+        own = [served.port.address for connection, served in self.clients.sessions() if connection.client == client]
+        return own[-1] if own else ""
 
     def cut_client(self, client: str) -> int:
         """End every connection of a client at once; returns how many there were."""

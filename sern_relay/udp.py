@@ -136,6 +136,12 @@ class RelayLanes:
             pump.close()
             self.server.close_session(session)
 
+    def address(self, client: ClientName) -> str:
+        """Where the client's datagrams come from; empty while it has no datagram lane, or has not spoken on it."""
+        lane = self._lanes.get(client)
+        address = None if lane is None else lane[0].address
+        return "" if address is None else f"{plain_host(address[0])}:{address[1]}"
+
     def problem(self, link: Link, within_s: float) -> str | None:
         """What is known about why no datagram passes to and from a client, as `DatagramWatch` wants it; None: the
         client has asked for no datagram lane, or cannot have one, which was said."""

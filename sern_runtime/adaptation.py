@@ -1,9 +1,10 @@
 """Runs the adaptation of one or many links on the event loop, and tells what it does: /api/mmcf and metrics."""
 
 import asyncio
+import json
 import logging
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 from sern_core.adaptation.adapter import SAMPLES, HopAdapter
@@ -12,16 +13,19 @@ from sern_core.adaptation.report import adapter_json, step_json
 from sern_core.bodies.codecs import Coder
 from sern_core.link.link import Link
 from sern_core.topics.rules import TopicRule
+from sern_core.vocabulary.errors import UsageError
 from sern_core.vocabulary.message import Message, TopicSpec
 from sern_core.vocabulary.types import CLASS_LABELS, CLASSES
 from sern_runtime import clock
 from sern_runtime.config.adaptation import AdaptationSection
+from sern_runtime.http_routes import JsonParts, JsonQuery, array
 from sern_runtime.metrics import Labels, Metrics
 from sern_runtime.optional import BACKOFF_S, OptionalParts
 
 HISTORY: Final = 60
 """Intervals that /api/mmcf tells of."""
 PART: Final = "adaptation"
+TOO_LARGE: Final = "the answer is too large; ask for fewer intervals: ?last=1"
 TERMS: Final = ("latency", "unreliability", "compute", "bandwidth")
 
 _log = logging.getLogger(__name__)
@@ -130,8 +134,31 @@ class Adaptation:
         if done.decision.switched:
             _log.info("%s: %s (%s)", adapter.link.peer, done.decision.chosen, done.decision.reason)
 
+    def view(self) -> JsonQuery:
+        """The route of /api/mmcf; `?last=N`: of each link the last N intervals alone."""
+
+        def read(query: Mapping[str, str]) -> JsonParts:
+            text = query.get("last", str(HISTORY))
+            if not (text.isascii() and text.isdecimal() and int(text[:9]) <= HISTORY):
+                raise UsageError(f"last is {text[:80]!r}; accepted: 0 to {HISTORY}")
+            return JsonParts(self._pieces(int(text)), TOO_LARGE)
+
+        return JsonQuery(("last",), read)
+
+    def _pieces(self, last: int) -> Iterator[str]:
+        yield json.dumps(self._about())[:-1] + ', "links": '
+        yield from array(self._link_json(link, last) for link in tuple(self._adapters) if link in self._adapters)
+        yield "}"
+
     def to_json(self) -> dict[str, Any]:
         """What is in force, and the last intervals of each link, the oldest first, as /api/mmcf tells them."""
+        return self._about() | {"links": [self._link_json(link, HISTORY) for link in self._adapters]}
+
+    def _link_json(self, link: Link, last: int) -> dict[str, Any]:
+        history = list(self._history.get(link, ()))
+        return {**adapter_json(self._adapters[link]), "history": history[max(0, len(history) - last) :]}
+
+    def _about(self) -> dict[str, Any]:
         weights, ranges = self._params.weights, self._params.ranges
         return {
             "policy": self._section.policy,
@@ -146,10 +173,6 @@ class Adaptation:
             "floors": dict(zip(CLASS_LABELS, self._section.floor_shares(), strict=True)),
             "interval_s": self._params.interval_s,
             "now_s": clock.now(),
-            "links": [
-                {**adapter_json(adapter), "history": list(self._history.get(link, ()))}
-                for link, adapter in self._adapters.items()
-            ],
         }
 
     def _by_peer(self) -> list[tuple[str, HopAdapter]]:

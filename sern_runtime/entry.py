@@ -23,11 +23,14 @@ def run_daemon(
     program: str,
     read_log: Callable[[], LogSection],
     main: Callable[[Shutdown], Coroutine[Any, Any, int | None]],
+    *,
+    log_format: logs.LogFormat | None = None,
 ) -> int:
-    """Run a daemon and say in one line what went wrong: exit code 2 for configuration, 1 for anything else."""
+    """Run a daemon and say in one line what went wrong: exit code 2 for configuration, 1 for anything else.
+    `log_format`: in place of `log.format` of the file."""
     try:
         section = read_log()
-        logs.configure(log_format=section.format.value, level=section.level.value.upper())
+        logs.configure(log_format=log_format or section.format.value, level=section.level.value.upper())
         return run(main)
     except ConfigError as error:
         print(f"{program}: {error}", file=sys.stderr)

@@ -1,6 +1,7 @@
 """What the HTTP server is asked for, without the server: an import of this costs nothing where there is none."""
 
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+import json
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 from typing import NamedTuple
 
 from sern_core.vocabulary.errors import UsageError
@@ -19,6 +20,25 @@ class JsonParts(NamedTuple):
 
     pieces: Iterator[str]
     too_large: str
+
+
+def array(values: Iterable[object]) -> Iterator[str]:
+    """The pieces of a JSON array, a value each."""
+    return _joined("[]", map(json.dumps, values))
+
+
+def table(rows: Iterable[tuple[str, object]]) -> Iterator[str]:
+    """The pieces of a JSON object, a member each."""
+    return _joined("{}", (f"{json.dumps(name)}: {json.dumps(value)}" for name, value in rows))
+
+
+def _joined(brackets: str, pieces: Iterable[str]) -> Iterator[str]:
+    yield brackets[0]
+    comma = ""
+    for piece in pieces:
+        yield comma + piece
+        comma = ", "
+    yield brackets[1]
 
 
 class JsonQuery(NamedTuple):

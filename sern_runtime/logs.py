@@ -3,7 +3,9 @@
     text   2026-01-31T12:00:00.123Z WARNING sern_relay.routing refused /cmd_vel from site1 client=site1
     json   {"time": "...", "level": "warning", "logger": "...", "message": "...", "client": "site1"}
 
-Fields come through `extra={"client": name}`. Under systemd (JOURNAL_STREAM is set) the text has no time of its own.
+Fields come through `extra={"client": name}`. Those that only programs need, `event` and `about`
+(sern_runtime/events.py), are in JSON alone: a text says them in words. Under systemd (JOURNAL_STREAM is set) the text
+has no time of its own.
 """
 
 import json
@@ -17,6 +19,7 @@ from contextlib import suppress
 from typing import Final, Literal, TextIO
 
 LogFormat = Literal["text", "json"]
+LOG_FORMAT_HELP: Final = "Log for people or for programs, in place of log.format in the file."
 REPEAT_INTERVAL_S: Final = 10.0
 """Warnings of one cause are written at most `REPEAT_BURST` times in this long, of one format `FORMAT_BURST` times."""
 REPEAT_BURST: Final = 5
@@ -27,6 +30,7 @@ MAX_WORDS: Final = 400
 """Characters of a message by which it is told from others, and by which it is shown when it was held back."""
 _Key = tuple[str, int, str]
 _STANDARD: Final = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "taskName"}
+_FOR_PROGRAMS: Final = frozenset({"event", "about"})
 
 
 def _fields(record: logging.LogRecord) -> dict[str, object]:
@@ -60,7 +64,8 @@ class TextFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         parts = [_utc(record)] if self._with_time else []
         parts += [record.levelname, record.name, _one_line(_message(record, self))]
-        parts += [f"{name}={_one_line(str(value))}" for name, value in _fields(record).items()]
+        fields = _fields(record).items()
+        parts += [f"{name}={_one_line(str(value))}" for name, value in fields if name not in _FOR_PROGRAMS]
         return " ".join(parts)
 
 

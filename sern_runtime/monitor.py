@@ -384,9 +384,11 @@ class ConnectionTable:
         max_connections: int = 1024,
         on_change: Callable[[], None] | None = None,
         on_gone: Callable[[int], None] | None = None,
+        on_capped: Callable[[str], None] | None = None,
         clock: Callable[[], float] = now,
     ) -> None:
-        """`on_gone(fd)`: a connection has ended, and its number may be another's next."""
+        """`on_gone(fd)`: a connection has ended, and its number may be another's next. `on_capped(source)`: one was cut
+        for a cap."""
         self.unbound = False
         """Whether libzmq has let go of an address that the socket listened on."""
         self.capped = 0
@@ -401,6 +403,7 @@ class ConnectionTable:
         self._half_open_by_source: Counter[str] = Counter()
         self._on_change = on_change
         self._on_gone = on_gone
+        self._on_capped = on_capped
         self._clock = clock
         self._monitor = SocketMonitor(socket, self._on_event)
 
@@ -545,6 +548,8 @@ class ConnectionTable:
         self.capped += 1
         connection.cut()
         self._not_half_open(fd, connection)
+        if self._on_capped is not None:
+            self._on_capped(connection.source)
 
     def _expire(self) -> None:
         now_s = self._clock()

@@ -1,9 +1,14 @@
-"""Losses and recoveries in pairs: whoever was told of the one is told of the other, at the same level."""
+"""Losses and recoveries in pairs: whoever was told of the one is told of the other, at the same level and as events."""
 
 import logging
 from dataclasses import dataclass
 from typing import Final
 
+from sern_runtime.events import EventLog
+
+SILENT: Final = "silent"
+ANSWERS: Final = "answers"
+"""Events of an outage that was said, and of its end."""
 SAY_AFTER_S: Final = 3.0
 """A path that is silent for less is no news: bad links do so all the time."""
 
@@ -17,8 +22,11 @@ class _Outage:
 class Outages:
     """Who is silent now, by name. Call `look` about once a second for each."""
 
-    def __init__(self, log: logging.Logger, level: int, *, after_s: float = SAY_AFTER_S) -> None:
+    def __init__(
+        self, log: logging.Logger, level: int, *, after_s: float = SAY_AFTER_S, events: EventLog | None = None
+    ) -> None:
         self._log = log
+        self._events = events or EventLog()
         self._level = level
         self._after_s = after_s
         self._outages: dict[str, _Outage] = {}
@@ -30,12 +38,15 @@ class Outages:
             if outage is not None:
                 del self._outages[peer]
                 if outage.said:
-                    self._log.log(self._level, "%s, after %.0f s", back, now - outage.since_s)
+                    after_s = now - outage.since_s
+                    self._events.say(
+                        self._log, self._level, ANSWERS, peer, "%s, after %.0f s", back, after_s, after_s=after_s
+                    )
         elif outage is None:
             self._outages[peer] = _Outage(now)
         elif not outage.said and now - outage.since_s >= self._after_s:
             outage.said = True
-            self._log.log(self._level, "%s", gone)
+            self._events.say(self._log, self._level, SILENT, peer, "%s", gone)
 
     def since_s(self, peer: str) -> float | None:
         """Since when it has been silent; None: it is not."""

@@ -53,6 +53,9 @@ class TemporaryRefusal:
 Lookup = Callable[[str, str], "str | Refusal | TemporaryRefusal | None"]
 """`lookup(public_key_z85, address) -> User-Id`, None for an unknown key, or a refusal."""
 
+Told = Callable[[str, str, str], None]
+"""`told(address, public_key_z85, why)`: a connection is refused."""
+
 Admit = Callable[[str], bool]
 """`admit(address) -> bool`: the connection cap, asked before the lookup. False is answered 300."""
 
@@ -74,8 +77,12 @@ class ZapCounters:
 class ZapHandler:
     """The ZAP handler of a context. Make it before the first server socket; `close()` after the last."""
 
-    def __init__(self, ctx: "zmq.Context[zmq.Socket[bytes]]", *, admit: Admit | None = None) -> None:
+    def __init__(
+        self, ctx: "zmq.Context[zmq.Socket[bytes]]", *, admit: Admit | None = None, refused: Told | None = None
+    ) -> None:
+        """`refused` is told of every refusal, in place of the log."""
         self.counters = ZapCounters()
+        self._refused = refused or _log_refusal
         self._ctx = ctx
         self._admit = admit
         self._lookups: dict[bytes, Lookup] = {}
@@ -139,6 +146,7 @@ class ZapHandler:
             probe = public_key in self._expected
             if not probe and self._admit is not None and not self._admit(address):
                 counters.capped += 1
+                self._refused(address, public_key, "too many connections")
                 return b"300", b"too many connections", b""
             lookup = self._lookups.get(domain)
             answer = None if lookup is None else lookup(public_key, address)
@@ -153,14 +161,18 @@ class ZapHandler:
         if isinstance(answer, Refusal) or not answer:
             counters.unknown_key += 1
             why = answer.reason if isinstance(answer, Refusal) else f"unknown key {public_key}"
-            _log.warning("refused a connection from %s: %s", address, why)
+            self._refused(address, public_key, why)
             return b"400", b"no such key", b""
         if isinstance(answer, TemporaryRefusal):
             counters.not_now += 1
-            _log.warning("refused a connection from %s for now: %s", address, answer.reason)
+            self._refused(address, public_key, f"for now: {answer.reason}")
             return b"300", b"not now", b""
         counters.admitted += 1
         return b"200", b"OK", answer.encode()
+
+
+def _log_refusal(address: str, _public_key: str, why: str) -> None:
+    _log.warning("refused a connection from %s: %s", address, why)
 
 
 class _Pinger(DealerSocket):

@@ -6,20 +6,22 @@ import typer
 
 from sern_runtime import version
 from sern_tools import check, keygen
+from sern_tools.clients import clients
 from sern_tools.demo import demo
 from sern_tools.demo_navigation import demo_navigation
 from sern_tools.demo_twin import demo_twin
 from sern_tools.echo import echo
+from sern_tools.events import events
 from sern_tools.explain import explain
 from sern_tools.lab.cli import app as lab_app
 from sern_tools.recover import recover
+from sern_tools.top import top
 from sern_tools.topics import topics
 
 app = typer.Typer(
     name="sern",
     help="Keep a robot's virtual twin and its operator useful over thin, lossy, broken links.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 
@@ -39,7 +41,10 @@ app.command("demo-navigation")(demo_navigation)
 app.add_typer(keygen.app, name="keygen")
 app.add_typer(lab_app, name="lab")
 app.command("check")(check.check_command)
+app.command()(top)
 app.command()(topics)
+app.command()(clients)
+app.command()(events)
 app.command()(echo)
 app.command()(explain)
 app.command()(recover)

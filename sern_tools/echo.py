@@ -105,6 +105,7 @@ class RatePrinter:
         self._ages_s: list[float] = []
         self._bytes = 0
         self._missed = 0
+        self._total = self._total_missed = 0
         self._last_seq: dict[StreamId, int] = {}
         self._since_s = clock.now()
 
@@ -133,7 +134,10 @@ class RatePrinter:
         ages = sorted(self._ages_s)
         age = f"age p50 {ages[len(ages) // 2]:.3f} max {ages[-1]:.3f} s" if ages else "no messages"
         hertz, kilobytes = len(ages) / interval_s, self._bytes / interval_s / 1000
-        self._out.write(f"{hertz:7.1f} Hz {kilobytes:9.1f} kB/s  {age}  not here {self._missed}\n")
+        self._total += len(ages)
+        self._total_missed += self._missed
+        totals = f"(in all {self._total}, {self._total_missed})"
+        self._out.write(f"{hertz:7.1f} Hz {kilobytes:9.1f} kB/s  {age}  not here {self._missed}  {totals}\n")
         self._out.flush()
         self._ages_s.clear()
         self._bytes = self._missed = 0

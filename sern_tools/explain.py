@@ -10,6 +10,7 @@ replayed in virtual time.
 import json
 import sys
 import textwrap
+import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -32,6 +33,8 @@ RECORDINGS: Final = (".bag", ".mcap", ".db3")
 WIDTH: Final = 100
 HANGING: Final = 35
 """Where the text of a story's lines begins."""
+RATES_S: Final = 1.0
+"""Between the two looks of which rates are."""
 LAST: Final = 12
 """Lines about messages, where neighbours that fared alike share one."""
 TERMS: Final = ("latency", "unreliability", "compute", "bandwidth")
@@ -171,8 +174,8 @@ def report(
 # --- one topic --------------------------------------------------------------------------------------------------------
 
 
-def story(told: Mapping[str, Any], *, last: int) -> Iterator[str]:
-    """What /api/trace told of one topic, as text."""
+def story(told: Mapping[str, Any], *, last: int, before: Mapping[str, Any] | None = None) -> Iterator[str]:
+    """What /api/trace told of one topic, as text; with what it told `before`, rates beside the totals."""
     topic, records = told["topic"], told["records"]
     peers = dict.fromkeys(
         [*(stream["peer"] for stream in told["streams"]), *(r["peer"] for r in records if "peer" in r)]
@@ -182,7 +185,7 @@ def story(told: Mapping[str, Any], *, last: int) -> Iterator[str]:
         # What arrived names its origin alone: over the one link that a client has, or over none that we know better.
         mine = [record for record in records if record.get("peer", peer) == peer]
         for stream in streams:
-            yield from _about(topic, stream, mine, told)
+            yield from _about(topic, stream, mine, told, _lately(stream, told, before))
         if not streams:
             yield f"{topic}, {peer}: the stream has ended"
         short = in_short(record for record in mine if record["topic"] == topic)
@@ -202,7 +205,30 @@ def story(told: Mapping[str, Any], *, last: int) -> Iterator[str]:
         yield f"{told['streams_left_out']} more streams; choose one link with --peer"
 
 
-def _about(topic: str, stream: Mapping[str, Any], records: Sequence[Record], told: Mapping[str, Any]) -> Iterator[str]:
+def _lately(stream: Mapping[str, Any], told: Mapping[str, Any], before: Mapping[str, Any] | None) -> str:
+    """The rates of a stream that goes out, between two looks; empty: they are not known."""
+    if before is None or "offered" not in stream:
+        return ""
+    names = ("peer", "origin", "direction")
+    for past in before["streams"]:
+        if all(past[name] == stream[name] for name in names) and past.get("offered", 0) <= stream["offered"]:
+            interval_s = max(told["now_s"] - before["now_s"], 1e-3)
+            rates = [
+                (total - earlier) / interval_s
+                for total, earlier in (
+                    (stream["offered"], past["offered"]),
+                    (stream["delivered"], past["delivered"]),
+                    (sum(stream["dropped"].values()), sum(past["dropped"].values())),
+                )
+            ]
+            offered, arrived, dropped = (f"{value:.1f}/s" for value in rates)
+            return f"; now {offered} offered, {arrived} arrive, {dropped} dropped"
+    return ""
+
+
+def _about(
+    topic: str, stream: Mapping[str, Any], records: Sequence[Record], told: Mapping[str, Any], lately: str
+) -> Iterator[str]:
     sends = stream["direction"] == "send"
     way = f"to {stream['peer']}" if sends else f"received from {stream['peer']}"
     kind = "reliable" if stream["reliable"] else f"best effort, the newest {stream['depth']} kept"
@@ -222,8 +248,8 @@ def _about(topic: str, stream: Mapping[str, Any], records: Sequence[Record], tol
         yield "  what did not come is told where it is sent: ask that daemon, or the relay, with --api"
         return
     yield from _wrapped(f"  now       {_now(stream)}", 12)
-    so_far = _counted(stream)
-    yield f"  so far    {so_far}" + (f"; refused: {stream['refused']}" if stream["refused"] else "")
+    refused = f"; refused: {stream['refused']}" if stream["refused"] else ""
+    yield from _wrapped(f"  so far    {_counted(stream)}{refused}{lately}", 12)
     todo = advice([record for record in records if record["topic"] == topic], _troubled(stream))
     if todo:
         yield from _wrapped(f"  to do     {todo}", 12)
@@ -398,8 +424,10 @@ def explain(
                 told = live_topic(address, topic, peer)
                 if as_json:
                     sys.stdout.write(json.dumps(told, indent=1) + "\n")
-                else:
-                    print("\n".join(story(told, last=last)).rstrip())
+                    return
+                time.sleep(RATES_S)
+                before, told = told, live_topic(address, topic, peer)
+                print("\n".join(story(told, last=last, before=before)).rstrip())
                 return
             steps, weights, records, topics = live(address, peer)
         if as_json:

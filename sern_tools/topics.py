@@ -61,7 +61,8 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One line of the table, and one element of `--json`. `age_s` of the freshest sample at this daemon."""
+    """One line of the table, and one element of `--json`: a rate beside each total. `age_s` of the freshest sample at
+    this daemon."""
 
     topic: str
     priority: str
@@ -77,6 +78,12 @@ class Row:
     queued: int
     dropped: int
     dropped_by_reason: Mapping[str, int]
+    in_messages: int
+    out_messages: int
+    in_bytes: int
+    out_bytes: int
+    dropped_hz: float
+    dropped_hz_by_reason: Mapping[str, float]
 
 
 def _is_relay(answer: Mapping[str, Any]) -> bool:
@@ -131,6 +138,7 @@ def compare(
         if past is None or counts.received < past.received or counts.delivered < past.delivered:
             past = Counts(counts.priority)
         identity = identities.get(name)
+        lately = counts.reasons - past.reasons
         rows.append(
             Row(
                 topic=name,
@@ -147,6 +155,12 @@ def compare(
                 queued=counts.queued,
                 dropped=counts.reasons.total(),
                 dropped_by_reason=dict(counts.reasons.most_common()),
+                in_messages=counts.received,
+                out_messages=counts.delivered,
+                in_bytes=counts.received_bytes,
+                out_bytes=counts.delivered_bytes,
+                dropped_hz=lately.total() / interval_s,
+                dropped_hz_by_reason={reason: count / interval_s for reason, count in lately.most_common()},
             )
         )
     return sorted(rows, key=lambda row: (CLASS_LABELS.index(row.priority), row.topic))
@@ -208,6 +222,10 @@ def _why(row: Row) -> str:
     return " ".join(f"{reason} {count}" for reason, count in list(row.dropped_by_reason.items())[:3])
 
 
+def _why_now(row: Row) -> str:
+    return " ".join(f"{reason} {hz:.1f}/s" for reason, hz in list(row.dropped_hz_by_reason.items())[:3])
+
+
 class Column(NamedTuple):
     """One column of the table, shown on terminals of at least `width` characters."""
 
@@ -225,15 +243,21 @@ COLUMNS: Final = (
     Column("class", lambda row: row.priority, number=False),
     Column("type", lambda row: row.type_name or "", 150, number=False),
     Column("owner", lambda row: row.owner or "", 110, number=False),
+    Column("in", lambda row: si(row.in_messages), 170),
     Column("in Hz", lambda row: f"{row.in_hz:.1f}" if row.in_hz else ""),
+    Column("out", lambda row: si(row.out_messages), 170),
     Column("out Hz", lambda row: f"{row.out_hz:.1f}" if row.out_hz else ""),
+    Column("in B", lambda row: si(row.in_bytes), 170),
     Column("in B/s", lambda row: si(row.in_bytes_per_s), 100),
+    Column("out B", lambda row: si(row.out_bytes), 170),
     Column("out B/s", lambda row: si(row.out_bytes_per_s), 100),
     Column("age s", lambda row: "" if row.age_s is None else f"{row.age_s:.{3 if row.age_s < 10 else 0}f}"),
     Column("subs", lambda row: str(row.subscribers or ""), 100),
     Column("queued", lambda row: str(row.queued or ""), 100),
     Column("drops", lambda row: str(row.dropped or "")),
+    Column("drop/s", lambda row: f"{row.dropped_hz:.1f}" if row.dropped_hz else ""),
     Column("why", _why, 100, number=False),
+    Column("now", _why_now, 170, number=False),
 )
 
 

@@ -42,7 +42,7 @@ from sern_core.link.sender import Sender
 from sern_core.link.session import Session
 from sern_core.link.streams_in import StreamsIn
 from sern_core.link.streams_out import StreamsOut
-from sern_core.link.view import Held, LinkSettings, LinkView, Sending, TopicView, Undelivered
+from sern_core.link.view import Counted, Held, LinkSettings, LinkView, Sending, TopicView, Undelivered
 from sern_core.path.lanes import LANE_UDP, LANE_ZMQ, Lane
 from sern_core.stream.in_stream import Reassembly
 from sern_core.stream.out_channel import OutChannel
@@ -83,6 +83,10 @@ class Link:
         self.definitions = definitions
         self.finish: Callable[[Link, float], bool] | None = None
         """Called before more is read: whether all that came of what was read before is done by now."""
+        self.heard_s: float | None = None
+        """When the peer was last heard, on whatever lane; None: never."""
+        self.heard_bytes = 0
+        """Bytes of all that it has sent, headers included."""
         self._unreadable: RemoteError | None = None  # found at a time when nobody could be told
         end = self.end = End(name=name, boot=boot, peer=peer, initiator=initiator, params=link, trace=trace, now=now)
         owner = self._owner = Owner(self, handler, end)
@@ -265,6 +269,8 @@ class Link:
     def receive(self, data: framing.Datagram, *, now: float, lane: int = LANE_ZMQ) -> None:
         """One datagram from the lane. Raises WireError or VersionError for bytes no honest peer sends; the session has
         ended then, as it has after an error of ours, of which the owner is told (`on_fault`)."""
+        self.heard_s = now
+        self.heard_bytes += len(data)
         try:
             if data[:4] == self.end.data_prefix and framing.HEADER_BYTES <= len(data) <= framing.MAX_DATAGRAM_BYTES:
                 state = self.lanes.by_id.get(lane)
@@ -387,6 +393,20 @@ class Link:
     def held(self) -> dict[TopicName, Held]:
         """Messages that wait and that are in flight, by the topic of the stream. Looks at every message."""
         return view.held(self.sender.channels.values())
+
+    def each_topic(self) -> Iterator[Counted]:
+        """Every topic that is counted, each looked at when it is asked for: it adds up by itself."""
+        by_topic: dict[TopicName, list[OutChannel]] = {}
+        for channel in self.sender.channels.values():
+            by_topic.setdefault(channel.stream.id.topic, []).append(channel)
+        for topic, counters in tuple(self.counters.items()):
+            channels = by_topic.get(topic, [])
+            held = view.held(channels).get(topic)
+            yield Counted(counters, view.topics(channels), Held(0, 0) if held is None else held)
+
+    def offered(self) -> list[StreamInfo]:
+        """Our streams that are open towards the peer."""
+        return [channel.stream for channel in self.sender.channels.values()]
 
     def undelivered(self) -> Iterator[Undelivered]:
         """Every message that the peer is not known to have."""

@@ -154,6 +154,15 @@ class Held(NamedTuple):
     in_flight: int
 
 
+class Counted(NamedTuple):
+    """A topic on its way out."""
+
+    counters: SendCounters
+    streams: tuple[TopicView, ...]
+    """Those of it that are open."""
+    held: Held
+
+
 class Undelivered(NamedTuple):
     """A message that the peer is not known to have."""
 

@@ -103,8 +103,8 @@ async def test_two_processes_with_one_name_are_told_of_each_other(
         await until(lambda: len(relay.hub.relayed) == len(topics_out(first)) > 0, "has its topics again")
         assert first.bridge.outbound.refusals == 0
         own = [record for record in caplog.records if said in record.getMessage()]
-        assert {record.name for record in own} == {"sern_client.link_news", "sern_relay.daemon"}
-        at_relay = [record for record in own if record.name == "sern_relay.daemon"]
+        assert {record.name for record in own} == {"sern_client.link_news", "sern_relay.comings"}
+        at_relay = [record for record in own if record.name == "sern_relay.comings"]
         assert relay.refusals["displaced"] == len(at_relay) >= 2
         assert at_relay[0].getMessage().endswith(" has no session any more")
         assert not any(record.levelname == "ERROR" for record in caplog.records)

@@ -124,7 +124,9 @@ async def bystanders(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> AsyncI
         for daemon in (robot, site, relay):
             await lab.end(daemon)
         connections = [m for m in caplog.messages if m.startswith(("site connected", "robot1 connected"))]
-        assert connections == ["site connected", "robot1 connected"], "a bystander had to connect again"
+        assert [m.partition(",")[0] for m in connections] == ["site connected", "robot1 connected"], (
+            "a bystander had to connect again"
+        )
     played = bodies(bag)["/count"]
     arrived = bodies(tmp_path / "site.bag")["/robot1/count"]
     assert arrived == [played[index % len(played)] for index in range(len(arrived))]

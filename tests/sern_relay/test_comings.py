@@ -7,8 +7,9 @@ from typing import Any
 import pytest
 
 from sern_core.vocabulary.types import ClientName
-from sern_relay.comings import Comings
+from sern_relay.comings import AWAY, CONNECTED, DENIED, FORGOTTEN, TAKEOVER, Comings
 from sern_runtime import clock
+from sern_runtime.events import EventLog
 from sern_runtime.outages import SAY_AFTER_S
 
 ROBOT = ClientName("robot")
@@ -50,3 +51,32 @@ def test_one_that_nobody_waits_for_any_more_is_new_when_it_comes(said: pytest.Lo
     comings.look({}, 1.0)
     comings.up(ROBOT, resumed=False)
     assert said.messages[-1] == "robot connected"
+
+
+def test_what_is_known_of_a_client_outlives_its_link_where_the_directory_has_it() -> None:
+    events = EventLog()
+    comings = Comings(events, remembered=lambda client: client == ROBOT, address=lambda _client: "192.0.2.1:4")
+    stranger = ClientName("stranger")
+    for client in (ROBOT, stranger):
+        comings.up(client, resumed=False)
+        comings.down(client, "gone")
+    comings.look({ROBOT: link(established=False), stranger: link(established=False)}, clock.now())
+    assert comings.clients.keys() == {ROBOT, stranger}
+    comings.look({}, clock.now())
+    assert comings.clients.keys() == {ROBOT}
+    coming = comings.clients[ROBOT]
+    assert (coming.up, coming.why, coming.address, coming.sessions, coming.waited_for) == (
+        False, "gone", "192.0.2.1:4", 1, False,
+    )  # fmt: skip
+    assert [event["kind"] for event in events.after(0) if event["about"] == ROBOT] == [CONNECTED, AWAY, FORGOTTEN]
+
+
+def test_a_takeover_is_another_event_than_what_the_rules_forbid(said: pytest.LogCaptureFixture) -> None:
+    events = EventLog()
+    comings = Comings(events)
+    comings.up(ROBOT, resumed=False)
+    comings.refused(ROBOT, "displaced", "another process connected as robot")
+    comings.refused(ROBOT, "forbidden", "robot may not publish /x")
+    assert [event["kind"] for event in events.after(0)] == [CONNECTED, TAKEOVER, DENIED]
+    assert comings.clients[ROBOT].takeovers == 1
+    assert said.messages[1:] == ["robot: another process connected as robot", "robot: robot may not publish /x"]

@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from sern_runtime.config.shared import LogSection
+from sern_runtime.entry import run_daemon
 from sern_runtime.logs import (
     FORMAT_BURST,
     MAX_CAUSES,
@@ -21,6 +23,7 @@ from sern_runtime.logs import (
     TextFormatter,
     configure,
 )
+from sern_runtime.loop import Shutdown
 
 
 @pytest.fixture
@@ -236,3 +239,14 @@ def test_the_journal_has_its_own_time(root_restored: None) -> None:
     configure(stream=stream, environment={"JOURNAL_STREAM": "8:1"})
     logging.getLogger("sern_test").warning("up")
     assert stream.getvalue() == "WARNING sern_test up\n"
+
+
+def test_the_command_line_has_the_last_word_about_the_format(
+    root_restored: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async def main(_shutdown: Shutdown) -> int:
+        logging.getLogger("test").warning("said")
+        return 0
+
+    assert run_daemon("sern-test", LogSection, main, log_format="json") == 0
+    assert json.loads(capsys.readouterr().err)["message"] == "said"

@@ -124,7 +124,7 @@ def test_every_event_can_be_told(event: TraceEvent) -> None:
     assert told and all(line.strip() and "None" not in line for line in told)
 
 
-def told_of(**stream: Any) -> str:
+def told_of(*, before: dict[str, Any] | None = None, **stream: Any) -> str:
     standing = {"waiting": 1, "under_way": 0, "seq": 3, "begun": False, "age_s": 0.4, "unsent_bytes": 10, "rank": 2}
     given = {
         "peer": "relay", "origin": "robot", "direction": "send", "up": True, "class": "state", "reliable": False,
@@ -132,7 +132,14 @@ def told_of(**stream: Any) -> str:
         "delivered": 1, "refused": 0, "dropped": {}, "standing": standing | BEHIND,
     } | stream  # fmt: skip
     answer = {"topic": "/scan", "now_s": 2.0, "steps": True, "streams": [given], "streams_left_out": 0, "records": []}
-    return "\n".join(story(answer, last=5))
+    earlier = None if before is None else answer | {"now_s": 1.5, "streams": [given | before]}
+    return "\n".join(story(answer, last=5, before=earlier))
+
+
+def test_a_rate_is_beside_each_total() -> None:
+    text = " ".join(told_of(before={"offered": 1, "delivered": 0}, dropped={"lifespan": 1}).split())
+    assert "of 3 offered 1 arrived; dropped: 1 lifespan; now 4.0/s offered, 2.0/s arrive, 0.0/s dropped" in text
+    assert "offered, " not in told_of(before={"offered": 99})  # it began anew
 
 
 def test_the_head_of_a_story_says_how_it_stands() -> None:

@@ -181,6 +181,7 @@ def test_a_narrow_terminal_keeps_what_matters_most() -> None:
     wide, middle, narrow = (text_of(rows, width) for width in (200, 120, 80))
     assert "nav_msgs/msg/Odometry" in wide
     assert "superseded 2 lifespan 1" in wide
+    assert "superseded 2.0/s lifespan 1.0/s" in wide
     assert "Odometry" not in middle
     assert "owner" in middle
     assert "owner" not in narrow

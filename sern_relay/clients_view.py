@@ -1,0 +1,97 @@
+"""/api/clients of a relay: every client that it knows, where it is, how it fares, and who was refused.
+
+Known are the names of the directory of keys, and whoever has a link or had one. A row has `state`:
+
+    connected   it has a session, and answers
+    silent      it has a session, and nothing that is sent to it is acknowledged
+    away        it was lost, and is waited for: `why`
+    forgotten   it was lost or said goodbye, and nothing is kept for it
+    never       its key is known here, and it has not come since the relay began
+
+The answer is made a few rows in a turn of the loop.
+"""
+
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from sern_core.link.link import Link
+from sern_core.relay.hub import Hub
+from sern_core.vocabulary.types import ClientName
+from sern_relay.admission import Admission
+from sern_relay.comings import Coming, Comings
+from sern_relay.refusals import Refusals
+from sern_runtime import clock
+from sern_runtime.events import wall_text
+from sern_runtime.http_routes import JsonParts
+
+TOO_LARGE: Final = "the answer is too large"
+
+
+@dataclass(frozen=True)
+class ClientsSource:
+    """What the rows are made of. `admission` has the names of the directory, `address(client)` says where a client
+    comes from now."""
+
+    relay: str
+    hub: Hub
+    comings: Comings
+    refusals: Refusals
+    admission: Admission
+    address: Callable[[ClientName], str]
+
+
+def clients_view(source: ClientsSource) -> JsonParts:
+    """The answer. Times by the wall clock are for people; `_s` are how long ago."""
+    head = {"name": source.relay, "role": "relay", "time": wall_text(time.time()), "now_s": clock.now()}
+    return JsonParts(_pieces(source, head), TOO_LARGE)
+
+
+def _pieces(source: ClientsSource, head: Mapping[str, object]) -> Iterator[str]:
+    yield json.dumps({**head, **source.refusals.to_json()})[:-1] + ', "clients": ['
+    comma = ""
+    for client in sorted({*source.admission.names, *source.hub.links, *source.comings.clients}):
+        yield comma + json.dumps(client_row(source, client))
+        comma = ", "
+    yield "]}"
+
+
+def client_row(source: ClientsSource, client: ClientName) -> dict[str, Any]:
+    """One client, as it is now; what is not known is None."""
+    now, wall_s = clock.now(), time.time()
+    link, coming = source.hub.links.get(client), source.comings.clients.get(client)
+    state = _state(link, coming)
+    view = None if link is None else link.observe(now=now)
+    up = view is not None and view.established
+    heard_at_s = link.heard_s if link is not None else coming.heard_s if coming is not None else None
+    since_s = None if coming is None else now - coming.since_s
+    heard_s = None if heard_at_s is None else now - heard_at_s
+    known = source.address(client) or (coming.address if coming is not None else "")
+    return {
+        "name": client,
+        "state": state,
+        "why": coming.why if coming is not None else "",
+        "address": known or None,
+        "lane": view.lane if view is not None and up else None,
+        "since": None if since_s is None else wall_text(wall_s - since_s),
+        "since_s": since_s,
+        "heard": None if heard_s is None else wall_text(wall_s - heard_s),
+        "heard_s": heard_s,
+        "round_trip_s": view.srtt_s or None if view is not None and up else None,
+        "loss": view.loss if view is not None and up else None,
+        "received_bytes": 0 if link is None else link.heard_bytes,
+        "sent_bytes": 0 if view is None else view.wire_bytes,
+        "streams": len(source.hub.routing.streams_of(client)),
+        "sessions": 0 if coming is None else coming.sessions,
+        "takeovers": 0 if coming is None else coming.takeovers,
+    }
+
+
+def _state(link: Link | None, coming: Coming | None) -> str:
+    if link is not None and link.established:
+        return "silent" if link.lane.stalled else "connected"
+    if coming is None:
+        return "never"
+    return "away" if link is not None and coming.waited_for else "forgotten"
