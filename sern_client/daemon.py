@@ -30,6 +30,7 @@ from sern_client.endpoints.base import (
 from sern_client.endpoints.composite import with_services
 from sern_client.factory import local_encoding, make_endpoint, make_link_topics
 from sern_client.guard import Guard
+from sern_client.keyring import ClientKeyring, KeyFiles
 from sern_client.link_news import SILENT, LinkNews
 from sern_client.link_state import LinkState
 from sern_client.objects_view import objects_view
@@ -44,6 +45,7 @@ from sern_core.objects.feed import PERIOD_S
 from sern_core.site.client import ClientCore, ClientEvents
 from sern_core.topics.patterns import PatternSet, compile_pattern
 from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.key_news import ClientKeys, RelayKeys
 from sern_core.vocabulary.trace import DecisionTrace
 from sern_core.vocabulary.types import CLASS_LABELS, DropReason, ObjectKind
 from sern_core.wire import framing
@@ -52,7 +54,6 @@ from sern_runtime.adaptation import Adaptation
 from sern_runtime.codec_pool import CodecPool, make_coder
 from sern_runtime.collector import CollectorWatch
 from sern_runtime.config.client import ClientFile, ServicesSection, load_client
-from sern_runtime.config.keys import load_secret, load_server_keys
 from sern_runtime.config.load import Loaded
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.http_routes import Health
@@ -84,6 +85,7 @@ async def run_client(path: Path, shutdown: Shutdown) -> int:
     try:
         await daemon.start()
         daemon.collector.settle()
+        shutdown.on_reload = daemon.reload
         await serve(shutdown, daemon.tasks)
         daemon.notifier.stopping("draining")
         await daemon.drain()
@@ -155,7 +157,10 @@ class ClientDaemon:
             if self.scene is not None:
                 endpoint.show_scene(self.scene)
         self.check = TableCheck(Tables(self.bridge, self.link_state, self.scene), now=now)
-        self.connection = Connection(self.core, model.relay, model.link, on_down=self.link_down)
+        self.keyring = self._make_keyring()
+        self.connection = Connection(
+            self.core, model.relay, model.link, on_down=self.link_down, on_refused=self._key_refused
+        )
         self.bridge.inbound.subscribed.begin(model.subscribe_patterns())
         self.core.subscribe_objects(model.object_selections(), now=now)
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
@@ -178,6 +183,31 @@ class ClientDaemon:
         if self.message_log is not None:
             core.link.end.fates = LoggedFates(self.message_log, self.parts)
         return core
+
+    def _make_keyring(self) -> ClientKeyring | None:
+        relay = self.loaded.model.relay
+        if relay.secret_key_file is None or relay.server_key_file is None:
+            return None
+        files = KeyFiles(self.loaded.resolve(relay.secret_key_file), self.loaded.resolve(relay.server_key_file))
+        return ClientKeyring(files, use=self._use_keys, tell=self._tell_keys, at_s=time.time)
+
+    def _use_keys(self, redial: bool) -> None:
+        if self.keyring is not None:
+            self.connection.use(self.keyring.keys, self.keyring.server_keys, redial=redial)
+
+    def _tell_keys(self, keys: ClientKeys) -> None:
+        if self.core.link.established:
+            self.core.tell_keys(keys, now=clock.now())
+            self._kick()
+
+    def _key_refused(self) -> None:
+        if self.keyring is not None:
+            self.keyring.refused()
+
+    def reload(self) -> None:
+        """SIGHUP: read the keys anew."""
+        if self.keyring is not None:
+            self.keyring.reload()
 
     def _make_goals(self) -> GoalWatch | None:
         sections = self.loaded.model.actions.use
@@ -236,10 +266,8 @@ class ClientDaemon:
         ros_types.load()
         model = self.loaded.model
         relay = model.relay
-        keys = load_secret(self.loaded.resolve(relay.secret_key_file)) if relay.secret_key_file else None
-        server_keys: tuple[str, ...] = ()
-        if relay.server_key_file:
-            server_keys = load_server_keys(self.loaded.resolve(relay.server_key_file), at_s=time.time())
+        if self.keyring is not None:
+            self.keyring.read()
         if model.http.listen is not None:
             with blamed_on(self.loaded.path, "http", "listen"):
                 self._http = self._make_http(model.http.listen)
@@ -253,7 +281,10 @@ class ClientDaemon:
             self.guard.start()
         self._ctx = zmq.Context()
         with blamed_on(self.loaded.path, "relay", "endpoint"):
-            self.connection.open(self._ctx, keys, server_keys)
+            if self.keyring is None:
+                self.connection.open(self._ctx, None, ())
+            else:
+                self.connection.open(self._ctx, self.keyring.keys, self.keyring.server_keys)
         self.tasks.append(asyncio.create_task(self._tick(), name="client-tick"))
         self.tasks.append(asyncio.create_task(self._tell_objects(), name="client-objects"))
         if self.scene is not None:
@@ -270,7 +301,13 @@ class ClientDaemon:
 
     # --- Shell: what becomes of the link ------------------------------------------------------------------------------
 
+    def keys_told(self, keys: RelayKeys) -> None:
+        if self.keyring is not None:
+            self.keyring.told(keys)
+
     def link_down(self, reason: str) -> None:
+        if self.keyring is not None and not self.core.link.established:
+            self.keyring.session_ended()
         self.link_state.soon()
         self.news.down(reason)
 
@@ -299,6 +336,8 @@ class ClientDaemon:
                 with self.parts.survive("message_log"):
                     self.message_log.flush()
             self.connection.tick()
+            if self.keyring is not None:
+                self.keyring.look()
             self.check.tick(now=clock.now())
             self.link_state.look()
             self.bridge.outbound.leaving.look(now=clock.now())
@@ -372,6 +411,7 @@ class ClientDaemon:
             health=lambda: Health(ok=True, reason="running"),
             ready=self.readiness,
             json_routes={
+                "/api/keys": lambda: {} if self.keyring is None else self.keyring.to_json(),
                 "/api/link": self._link_view,
                 "/api/site_objects": objects_view(self.core),
                 "/api/peers": self.link_state.to_json,
@@ -465,6 +505,8 @@ class ClientDaemon:
             if self.bridge.services is not None:
                 stack.push_async_callback(self.bridge.services.stop)
             stack.callback(self.connection.close)
+            if self.keyring is not None:
+                stack.push_async_callback(self.keyring.close)
             stack.callback(self.codecs.close)
             stack.push_async_callback(end_tasks, self.tasks)
 
