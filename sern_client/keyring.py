@@ -4,8 +4,8 @@ NAME.next.key beside NAME.key is the pair to come: its public half is offered to
 once the relay has it the connection is made anew with it. Nothing is lost meanwhile: what is reliable outlives
 connections and sessions. Whoever put the file there makes it NAME.key (`sern keys rotate`); until then both are tried.
 
-The relay tells which keys it has and will have. They are accepted in place of those in server_key_file, and written
-there if this process may.
+The relay tells which keys it has and will have. They are accepted in place of older ones in server_key_file, and
+written there if this process may.
 """
 
 import asyncio
@@ -129,8 +129,8 @@ class ClientKeyring:
     def told(self, said: RelayKeys) -> None:
         """The relay says which keys it has, and what became of the one that it was offered."""
         self._told = said
-        relay = tuple(dict.fromkeys(said.relay))
-        if relay and len(relay) <= MAX_RELAY_KEYS and all(map(is_key, relay)) and set(relay) != set(self.server_keys):
+        relay = self._merged(tuple(dict.fromkeys(said.relay)))
+        if set(relay) != set(self.server_keys):
             _log.warning(
                 "the relay has told of its keys; from now on accepted: %s (was: %s)",
                 *(", ".join(map(fingerprint, keys)) for keys in (relay, self.server_keys)),
@@ -143,6 +143,15 @@ class ClientKeyring:
             self._offered(other, said)
         elif not said.key:
             self._answer()
+
+    def _merged(self, told: tuple[str, ...]) -> tuple[str, ...]:
+        """The relay's keys, of which it has told some, the oldest first: those before them are over, and those behind
+        them were put there by hand for a change that the relay does not speak of yet."""
+        if not told or len(told) > MAX_RELAY_KEYS or not all(map(is_key, told)):
+            return self.server_keys
+        known = self.server_keys
+        first = min((known.index(key) for key in told if key in known), default=0)
+        return (*told, *(key for key in known[first:] if key not in told))
 
     def _offered(self, other: SecretKey, said: RelayKeys) -> None:
         if said.code:
