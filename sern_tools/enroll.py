@@ -22,7 +22,7 @@ from sern_core.vocabulary.names import client_name
 from sern_core.vocabulary.types import ClientName
 from sern_relay.keyring import OwnKeys
 from sern_runtime import clock
-from sern_runtime.config.key_changes import add_client
+from sern_runtime.config.key_changes import add_client, check_owner
 from sern_runtime.config.keys import (
     PUBLIC_SUFFIX,
     SECRET_SUFFIX,
@@ -85,8 +85,7 @@ class Opened:
         self.asking = self.directory / f".enrolling-{self.name}"
         self._accepting = accepting(self.asking)
         known = KeyDirectory(self.directory)
-        if not os.access(self.directory, os.W_OK):
-            raise ConfigError("may not be written by this user; use sudo -u sern", file=str(self.directory))
+        check_owner(self.directory)
         if known.keys_of(self.name) and not replacing:
             raise ConfigError(f"{self.name} has a key already; --replace revokes it", file=str(self.directory))
         self._forget()
@@ -293,6 +292,7 @@ async def ask_enrolment(endpoint: str, code: str, out: Path, *, replacing: bool 
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"can not be made: {error.strerror or error}", file=str(out)) from error
+    check_owner(out)
     if not os.access(out, os.W_OK):
         raise ConfigError("may not be written by this user; use sudo -u sern", file=str(out))
     client = EnrolmentClient(endpoint, code)

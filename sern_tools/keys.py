@@ -16,15 +16,12 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from sern_core.vocabulary.errors import ConfigError, RefusedError, SernError, UsageError
 from sern_core.vocabulary.names import client_name
 from sern_core.vocabulary.types import ClientName
 from sern_runtime.config.client import ClientFile, load_client
-from sern_runtime.config.key_changes import revoke, revoked_at, take_in
+from sern_runtime.config.key_changes import check_owner, revoke, revoked_at, take_in
 from sern_runtime.config.keys import (
     NEXT_SUFFIX,
     PUBLIC_SUFFIX,
@@ -174,29 +171,24 @@ def _row(name: ClientName, key: PublicKey, status: str, view: dict[str, Any]) ->
     }
 
 
-def _show(found: dict[str, Any], out: Console, err: Console) -> None:
+def _show(found: dict[str, Any]) -> None:
     relay = found["relay"]
     coming = f", to come {relay['next']}" if relay["next"] else ""
-    out.print(Text(f"relay {relay['name']}  {relay['fingerprint']}{coming}"), soft_wrap=True)
-    table = Table(box=None, pad_edge=False)
-    for title in ("client", "fingerprint", "status", "from", "until", "connected"):
-        table.add_column(title, no_wrap=True)
+    typer.echo(f"relay {relay['name']}  {relay['fingerprint']}{coming}")
+    rows = [("client", "fingerprint", "status", "from", "until", "connected")]
     for row in found["clients"]:
         connected = {None: "?", True: "yes", False: "no"}[row["connected"]]
-        cells = (
-            row["name"],
-            row["fingerprint"],
-            row["status"].replace("_", " "),
-            row["not_before"] or "",
-            row["not_after"] or "",
+        status = row["status"].replace("_", " ")
+        rows.append(
+            (row["name"], row["fingerprint"], status, row["not_before"] or "", row["not_after"] or "", connected)
         )
-        table.add_row(*(Text(cell) for cell in (*cells, connected)))
-    if found["clients"]:
-        out.print(table, soft_wrap=True)
-    else:
-        out.print("no client has a key")
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for cells in rows if found["clients"] else ():
+        typer.echo("  ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)).rstrip())
+    if not found["clients"]:
+        typer.echo("no client has a key")
     if found["problem"]:
-        err.print(Text(f"who is connected is not known: {found['problem']}"), soft_wrap=True)
+        typer.echo(f"who is connected is not known: {found['problem']}", err=True)
 
 
 # --- revoke ---------------------------------------------------------------------------------------------------------
@@ -209,9 +201,10 @@ def run_revoke(loaded: Loaded[RelayFile], name: str, *, at_s: float, out: Callab
     known = KeyDirectory(directory)
     before = revoked_at(known, client)
     if client not in known.names and before is None:
-        near = difflib.get_close_matches(client, known.names, n=3)
+        near = sorted(difflib.get_close_matches(client, known.names, n=3))
         hint = f"; did you mean {' or '.join(near)}?" if near else f"; there are: {', '.join(known.names) or 'none'}"
         raise UsageError(f"no client {client} has a key in {directory}{hint}")
+    check_owner(directory)
     done = revoke(directory, client, at_s=at_s)
     if done.keys:
         out(f"revoked {', '.join(fingerprint(key.key) for key in done.keys)} of {client}; kept in {done.file}")
@@ -234,6 +227,7 @@ def run_revoke(loaded: Loaded[RelayFile], name: str, *, at_s: float, out: Callab
 
 def next_pair(secret: Path, *, out: Callable[[str], None]) -> SecretKey:
     """The pair to come beside `secret`: the one that an earlier run made, or a new one."""
+    check_owner(secret)
     coming = secret.with_suffix(NEXT_SUFFIX)
     if coming.exists():
         pair = load_secret(coming)
@@ -362,7 +356,7 @@ def list_command(
         if as_json:
             typer.echo(json.dumps(found, indent=1))
         else:
-            _show(found, Console(highlight=False), Console(stderr=True, highlight=False))
+            _show(found)
 
     reported(PROGRAM, run)
 
@@ -388,6 +382,7 @@ def add_command(
         if not valid:
             raise UsageError(f"{client} has no key in {directory} that holds; use sern enroll open {client}")
         newest = max(valid, key=lambda each: (each.not_after_s or float("inf"), each.key != key))
+        check_owner(directory)
         try:
             take_in(directory, client, newest.key, key, at_s=at_s, overlap_s=loaded.model.relay.key_overlap_s)
         except RefusedError as error:

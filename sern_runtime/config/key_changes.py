@@ -3,6 +3,7 @@ leaves keys that hold as before or as they are to, and is done again from its be
 
 import fcntl
 import os
+import pwd
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -10,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from sern_core.vocabulary.errors import ConfigError, RefusedError
+from sern_core.vocabulary.errors import ConfigError, RefusedError, UsageError
 from sern_core.vocabulary.types import ClientName
 from sern_runtime.config.keys import (
     MAX_KEYS,
@@ -30,6 +31,21 @@ from sern_runtime.config.keys import (
 MAX_VALID: Final = 4
 """Keys of one client that hold at a time, as far as it adds them itself."""
 REVOKED_DIR_MODE: Final = 0o700
+
+
+def check_owner(path: Path) -> None:
+    """What another user than the owner of a file or folder writes there the daemon may not be able to read: UsageError
+    that says as whom to do it. What is not there belongs to nobody."""
+    try:
+        owner = path.stat().st_uid
+    except OSError:
+        return
+    if owner != os.geteuid():
+        try:
+            name = pwd.getpwuid(owner).pw_name
+        except KeyError:
+            name = f"'#{owner}'"
+        raise UsageError(f"{path} belongs to {name}: give the command as that user, with sudo -u {name}")
 
 
 @contextmanager
