@@ -72,7 +72,10 @@ class Dialer:
         self._keys = keys
         self._server_keys = tuple(server_keys)
         self._events = events
+        self._made_with: tuple[CurvePair | None, str | None] = keys, None
         self._was_up = False
+        self._refusing = False
+        """Whether its owner is being told that the relay does not know our key: another attempt follows anyway."""
         self._handshake_ivl_ms = int(handshake_interval_s * 1000)
         self._heartbeat_timeout_ms = int(heartbeat_timeout_s * 1000)
         self._random = random
@@ -96,11 +99,13 @@ class Dialer:
         def attach(socket: "zmq.Socket[bytes]") -> None:
             self._watch = TransportWatch(socket, self._up, self._down, self._refused, self._give_up)
 
+        server_key = self._server_keys[self.attempt % len(self._server_keys)] if self._server_keys else None
+        self._made_with = self._keys, server_key
         raw = make_client(
             self._ctx,
             self._endpoint,
             self._keys,
-            self._server_keys[self.attempt % len(self._server_keys)] if self._server_keys else None,
+            server_key,
             heartbeat_timeout_ms=self._heartbeat_timeout_ms,
             max_message_bytes=LANE_MESSAGE_BYTES,
             handshake_ivl_ms=self._handshake_ivl_ms,
@@ -113,10 +118,18 @@ class Dialer:
         self._inflow = Inflow(self._socket, self._taken, self._endless)
 
     def use(self, keys: CurvePair | None, server_keys: Sequence[str]) -> None:
-        """Other keys, for the sockets that are made from now on."""
+        """Other keys, for the sockets that are made from now on. One that was made with keys that are over is kept
+        while it is connected, and made anew when it is not: libzmq would try them for ever."""
         if self._server_keys != tuple(server_keys):
             self.attempt = 0
         self._keys, self._server_keys = keys, tuple(server_keys)
+        if self._socket is not None and self._stale and not self._was_up and not self._refusing:
+            self.again("other keys are used")
+
+    @property
+    def _stale(self) -> bool:
+        keys, server_key = self._made_with
+        return keys != self._keys or (server_key is not None and server_key not in self._server_keys)
 
     def _reopen(self) -> None:
         self._rebuild = None
@@ -169,12 +182,14 @@ class Dialer:
 
     def _down(self, reason: str) -> None:
         self._events.down(reason)
-        if len(self._server_keys) > 1 and not self._was_up:
+        if self._stale or (len(self._server_keys) > 1 and not self._was_up):
             self.again(reason)  # the relay may have another of the keys it announced
         self._was_up = False
 
     def _refused(self, reason: str) -> None:
+        self._refusing = True
         self._events.refused(reason)
+        self._refusing = False
         self._give_up(reason)
 
     def _give_up(self, reason: str) -> None:

@@ -353,9 +353,7 @@ class RelayDaemon:
             return
         if own.now != self.keyring.own.now:
             self.server.rekey(own.now, ZAP_DOMAIN)
-            _log.warning(
-                "the relay has a new key, %s; connections that there are go on", fingerprint(own.now.public_key)
-            )
+            _log.warning("the relay has a new key, %s: clients connect anew", fingerprint(own.now.public_key))
         self.keyring.use(own, overlap_s=model.relay.overlap_s)
 
     def _in_force(self, now: float) -> None:

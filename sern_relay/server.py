@@ -266,10 +266,10 @@ class RelayServer:
         return len(gone)
 
     def rekey(self, keys: CurvePair, zap_domain: str) -> None:
-        """Have new connections prove the relay's identity with other keys; those that there are go on.
+        """Prove the relay's identity with other keys from now on.
 
-        libzmq copies the keys of a socket when it binds: so it is bound anew, and clients that knock meanwhile try
-        again by themselves.
+        libzmq copies the keys of a socket when it binds: so it is bound anew. That ends the connections that there are,
+        and clients come back by themselves; sessions with a datagram lane go on meanwhile.
         """
         raw = self.socket.socket
         serve_curve(raw, keys, zap_domain)

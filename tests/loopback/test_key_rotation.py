@@ -97,7 +97,7 @@ async def test_a_client_goes_over_to_a_new_key(tmp_path: Path, bag: Path, udp: b
         await world.end()
 
 
-async def test_the_relay_goes_over_to_a_new_key_and_keeps_its_connections(tmp_path: Path, bag: Path) -> None:
+async def test_the_relay_goes_over_to_a_new_key_while_messages_run(tmp_path: Path, bag: Path) -> None:
     async with Lab(tmp_path, "robot1", "site") as lab:
         world = World(lab, bag, udp=False)
         await world.start()
@@ -109,12 +109,27 @@ async def test_the_relay_goes_over_to_a_new_key_and_keeps_its_connections(tmp_pa
         await world.rotate_relay(switch=True)
         assert load_secret(tmp_path / "relay.key") == coming and not (tmp_path / f"relay{NEXT_SUFFIX}").exists()
         await until(lambda: [key.key for key in load_public(tmp_path / "relay.pub").keys] == [coming.public_key])
-        assert "robot1 lost" not in world.relay.text and "robot1 has gone" not in world.relay.text
+        await world.robot.until(lambda: world.relay.json("/api/keys")["clients"]["robot1"]["in_use"], "is back")
         count = delivered(world.site, CHAT)
         world.relay.kill()  # the next process has the new key alone
         world.relay = await lab.process(world.relay_file).ready()
         await world.arrived(min(count + 500, COUNT))
         await world.end()
+
+
+@pytest.mark.parametrize("udp", [True, False], ids=["udp", "tcp"])
+async def test_clients_are_back_at_a_relay_that_goes_over_to_a_new_key(tmp_path: Path, udp: bool) -> None:
+    async with Lab(tmp_path, "robot1") as lab:
+        relay = await lab.process(lab.relay_file(relay={"udp": udp})).ready()
+        robot = await lab.process(lab.client_file("robot1", DEAD_ENDS)).ready()
+        loaded = load_relay(relay.config)
+        for _ in range(2):
+            await asyncio.to_thread(keys.rotate_relay, loaded, switch=False, force=False, out=print)
+            await asyncio.to_thread(keys.rotate_relay, loaded, switch=True, force=False, out=print)
+            mark = fingerprint(load_secret(tmp_path / "robot1.key").public_key)
+            await robot.until(lambda m=mark: relay.json("/api/keys")["clients"]["robot1"]["in_use"] == m, "is back")
+        await robot.stop()
+        await relay.stop()
 
 
 async def test_a_relay_does_not_go_over_while_a_client_would_be_locked_out(tmp_path: Path) -> None:
