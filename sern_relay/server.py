@@ -21,7 +21,7 @@ from sern_runtime.dscp import Marks
 from sern_runtime.inflow import Inflow
 from sern_runtime.monitor import ConnectionTable, TcpHandle
 from sern_runtime.pump import LANE_MESSAGE_BYTES, Pump
-from sern_runtime.zmq_setup import CurvePair, bind_all, make_server, serve_curve
+from sern_runtime.zmq_setup import CurvePair, bind_all, make_server, serve_curve, unbind
 from sern_runtime.zmq_socket import RouterSocket, SendResult
 
 MAX_PORTS: Final = 4
@@ -275,7 +275,7 @@ class RelayServer:
         serve_curve(raw, keys, zap_domain)
         for endpoint in self._listen:
             self.connections.unbound = False
-            raw.unbind(endpoint)
+            unbind(raw, endpoint)
             self.connections.await_unbound(clock.now() + UNBIND_S)
         self._to_bind = self._listen
         self._bind()

@@ -9,10 +9,18 @@ import pytest
 from typer.testing import CliRunner
 
 from sern_core.vocabulary.errors import SernError
-from sern_core.vocabulary.types import TopicName
+from sern_core.vocabulary.types import ClientName, TopicName
 from sern_runtime.config.client import load_client
 from sern_runtime.config.key_changes import MAX_VALID
-from sern_runtime.config.keys import NEXT_SUFFIX, fingerprint, load_public, load_secret
+from sern_runtime.config.keys import (
+    NEXT_SUFFIX,
+    PublicKey,
+    PublicKeys,
+    fingerprint,
+    load_public,
+    load_secret,
+    write_public,
+)
 from sern_runtime.config.relay import load_relay
 from sern_tools import keys
 from sern_tools.commands import app
@@ -22,6 +30,7 @@ from tests.support import until
 CHAT = TopicName("/robot1/chat")
 STEADY = {"rate": 1}
 COUNT = 4000
+ROBOT = ClientName("robot1")
 DEAD_ENDS = {"kind": "synthetic", "role": "robot", "topics": 1}
 
 
@@ -130,6 +139,26 @@ async def test_clients_are_back_at_a_relay_that_goes_over_to_a_new_key(tmp_path:
             await robot.until(lambda m=mark: relay.json("/api/keys")["clients"]["robot1"]["in_use"] == m, "is back")
         await robot.stop()
         await relay.stop()
+
+
+@pytest.mark.parametrize("listen", ["tcp://*:{0}", "tcp://0.0.0.0:{0}", "tcp://127.0.0.1:{0}", "ipc://relay.ipc"])
+async def test_a_relay_listens_with_its_new_key_wherever_it_did(tmp_path: Path, listen: str) -> None:
+    async with Lab(tmp_path, "robot1") as lab:
+        relay = await lab.relay(lab.relay_file(relay={"listen": [listen.format(lab.port)]}))
+        if listen.startswith("ipc"):
+            lab.endpoint = f"ipc://{tmp_path}/relay.ipc"
+        assert relay.server is not None
+        robot = await lab.connected(lab.client_file("robot1", DEAD_ENDS))
+        old = load_public(tmp_path / "relay.pub").keys[0].key
+        new = lab.make_relay_keys()  # the robot reads it when it is told to, as if it were given the file
+        both = (PublicKey(old), PublicKey(new.public_key))
+        write_public(tmp_path / "relay.pub", PublicKeys(ClientName("relay"), both), replace=True)
+        robot.reload()
+        relay.reload()
+        await until(lambda: robot.keyring is not None and robot.keyring.server_keys == (new.public_key,))
+        await until(lambda: relay.server is not None and relay.server.session_key(ROBOT) is not None, "it is back")
+        await lab.end(robot)
+        await lab.end(relay)
 
 
 async def test_a_relay_does_not_go_over_while_a_client_would_be_locked_out(tmp_path: Path) -> None:
