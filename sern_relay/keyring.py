@@ -22,7 +22,7 @@ from sern_core.vocabulary.key_news import ClientKeys, RelayKeys
 from sern_core.vocabulary.types import ClientName
 from sern_relay.admission import Admission
 from sern_runtime import clock
-from sern_runtime.config.key_changes import take_in
+from sern_runtime.config.key_changes import check_new, take_in
 from sern_runtime.config.keys import NEXT_SUFFIX, KeyDirectory, KeyStatus, SecretKey, fingerprint, is_key, load_secret
 
 MAX_TOLD: Final = 8
@@ -147,6 +147,10 @@ class RelayKeyring:
         if self.overlap_s is None:
             why = "this relay takes no keys over the link (relay.rotate_keys); have its operator add it: sern keys add"
             raise RefusedError("forbidden", why)
+        # By what is in force, so that a client that asks again and again has no file read.
+        if not is_key(key):
+            raise RefusedError("bad_key", "what was offered is no CURVE key")
+        check_new(directory, client, asking, key, at_s=time.time())
         took = await asyncio.to_thread(
             take_in, directory.path, client, asking, key, at_s=time.time(), overlap_s=self.overlap_s
         )

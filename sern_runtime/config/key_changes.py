@@ -74,20 +74,27 @@ def take_in(directory: Path, name: ClientName, asking: str, new: str, *, at_s: f
         return _take_in(directory, name, asking, new, at_s, overlap_s)
 
 
+def check_new(known: KeyDirectory, name: ClientName, asking: str, new: str, *, at_s: float) -> PublicKey:
+    """The entry of the key that asks, where `new` may come beside it. RefusedError otherwise."""
+    if known.lookup(new, at_s=at_s).status is not KeyStatus.UNKNOWN:
+        raise RefusedError("bad_key", "the relay knows that key, and it is none that can be taken; make another")
+    old = known.lookup(asking, at_s=at_s)
+    if old.status is not KeyStatus.VALID or old.name != name or old.key is None:
+        raise RefusedError("old_key", "the key that asks does not hold any more")
+    if len([key for key in known.keys_of(name) if key.status(at_s) is KeyStatus.VALID]) >= MAX_VALID:
+        raise RefusedError("too_many_keys", f"{name} has {MAX_VALID} keys that hold; wait until the oldest have ended")
+    return old.key
+
+
 def _take_in(directory: Path, name: ClientName, asking: str, new: str, at_s: float, overlap_s: float) -> PublicKey:
     known = KeyDirectory(directory)
     match = known.lookup(new, at_s=at_s)
     if match.status is KeyStatus.VALID and match.name == name and match.key is not None:
         return match.key
-    if match.status is not KeyStatus.UNKNOWN:
-        raise RefusedError("bad_key", "the relay knows that key, and it is none that can be taken; make another")
-    old, file = known.lookup(asking, at_s=at_s), known.file_of(asking)
-    if old.status is not KeyStatus.VALID or old.name != name or old.key is None or file is None:
-        raise RefusedError("old_key", "the key that asks does not hold any more")
-    if len([key for key in known.keys_of(name) if key.status(at_s) is KeyStatus.VALID]) >= MAX_VALID:
-        raise RefusedError("too_many_keys", f"{name} has {MAX_VALID} keys that hold; wait until the oldest have ended")
-    added = PublicKey(new, not_after_s=old.key.not_after_s)
-    ends_s = min(at_s + overlap_s, old.key.not_after_s or float("inf"))
+    old, file = check_new(known, name, asking, new, at_s=at_s), known.file_of(asking)
+    assert file is not None
+    added = PublicKey(new, not_after_s=old.not_after_s)
+    ends_s = min(at_s + overlap_s, old.not_after_s or float("inf"))
     entries = [
         replace(key, not_after_s=ends_s) if key.key == asking else key
         for key in load_public(file).keys

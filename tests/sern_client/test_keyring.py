@@ -64,7 +64,7 @@ async def test_the_pair_to_come_is_offered_and_used_once_it_is_taken(tmp_path: P
     # Then its file is put in place.
     site.files.next.replace(site.files.secret)
     site.keys.reload()
-    assert site.keys.keys == coming and site.keys.other is None and site.used == [True]
+    assert (site.keys.keys, site.keys.other, site.used) == (coming, None, [True])
 
 
 async def test_what_was_refused_is_offered_again_after_a_while(tmp_path: Path, relay: tuple[str, ...]) -> None:
@@ -74,14 +74,14 @@ async def test_what_was_refused_is_offered_again_after_a_while(tmp_path: Path, r
     site.keys.told(RelayKeys((relay[0],), takes=False))
     no = RelayKeys((relay[0],), takes=False, key=coming.public_key, code="forbidden", why="not here")
     site.keys.told(no)
-    assert site.keys.problem == "not here" and site.keys.keys == site.first
+    assert (site.keys.problem, site.keys.keys) == ("not here", site.first)
     site.keys.look()
     assert len(site.told) == 1
     site.now_s += OFFER_AGAIN_S
     site.keys.look()
     assert [said.key for said in site.told] == [coming.public_key] * 2
     site.keys.told(RelayKeys((relay[0],), takes=False, key=coming.public_key))
-    assert site.keys.problem == "" and site.keys.keys == coming
+    assert (site.keys.problem, site.keys.keys) == ("", coming)
 
 
 async def test_a_client_whose_key_is_refused_tries_the_other_and_what_is_in_the_files(

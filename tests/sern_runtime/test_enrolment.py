@@ -3,7 +3,7 @@
 import asyncio
 import re
 import socket as socketlib
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any
 
@@ -11,7 +11,7 @@ import pytest
 
 from sern_core.vocabulary.errors import SernError
 from sern_core.vocabulary.types import ClientName
-from sern_runtime import enrolment
+from sern_runtime import clock
 from sern_runtime.config.keys import SecretKey, fingerprint, generate
 from sern_runtime.enrolment import (
     MAX_CONNECTIONS,
@@ -66,7 +66,7 @@ class Relayed:
         self.host, _, port = target.removeprefix("tcp://").rpartition(":")
         self.port = int(port)
         self.recorded = b""
-        self.change = bytes
+        self.change: Callable[[bytes], bytes] = bytes
         self._server: asyncio.Server | None = None
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -120,10 +120,10 @@ def test_a_code_is_read_as_people_write_it() -> None:
 async def test_both_ends_get_what_they_need_once_the_operator_has_accepted(offer: Offer) -> None:
     code, pair, told = new_code(), generate(ROBOT), asyncio.Event()
     async with server(offer, code) as relay, client(relay.endpoint, code) as robot:
-        assert (await robot.offer())[0] == offer and relay.state is State.OPEN
+        assert (await robot.offer())[0] == offer
         bringing = asyncio.create_task(robot.bring(pair.public_key, told=told.set))
         await told.wait()
-        assert relay.state is State.WAITING and relay.key == pair.public_key and relay.source == HOST
+        assert (relay.state, relay.key, relay.source) == (State.WAITING, pair.public_key, HOST)
         assert not bringing.done()
         relay.accept()
         await bringing
@@ -166,10 +166,11 @@ async def test_wrong_codes_are_counted_and_burn_the_right_one(offer: Offer) -> N
 async def test_a_code_is_over_at_its_time(offer: Offer, monkeypatch: pytest.MonkeyPatch) -> None:
     async with server(offer, new_code(), valid_s=600.0) as relay:
         relay.look()
-        assert not relay.burnt
-        monkeypatch.setattr(enrolment.clock, "now", lambda: relay.ends_s)
-        relay.look()
-        assert relay.burnt == "its time is over" and relay.state is State.REFUSED
+        assert (relay.burnt, relay.state) == ("", State.OPEN)
+        with monkeypatch.context() as patch:
+            patch.setattr(clock, "now", lambda: relay.ends_s)
+            relay.look()
+        assert (relay.burnt, relay.state) == ("its time is over", State.REFUSED)
 
 
 async def test_two_keys_with_one_code_burn_it(offer: Offer) -> None:

@@ -11,7 +11,6 @@ from typer.testing import CliRunner, Result
 
 from sern_core.vocabulary.errors import SernError
 from sern_core.vocabulary.types import ClientName
-from sern_runtime.config import key_changes
 from sern_runtime.config.key_changes import revoke
 from sern_runtime.config.keys import (
     KeyDirectory,
@@ -115,7 +114,7 @@ def test_errors_are_one_line(lab: Lab, words: tuple[str, ...], said: str) -> Non
 
 def test_what_belongs_to_another_user_is_left_alone(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     config, stranger = str(lab.relay_file()), os.geteuid() + 1
-    monkeypatch.setattr(key_changes.os, "geteuid", lambda: stranger)
+    monkeypatch.setattr(os, "geteuid", lambda: stranger)
     for words in (("revoke", "robot1"), ("rotate",)):
         done = sern("keys", *words, "--config", config)
         assert done.exit_code == 2 and "give the command as that user, with sudo -u" in done.stderr
@@ -157,7 +156,7 @@ def test_a_revocation_that_ends_in_the_middle_is_done_again(
 def test_a_process_that_is_no_daemon_of_ours_is_not_told(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(keys, "get_json", lambda _api, _path: {"pid": 1})
     killed: list[int] = []
-    monkeypatch.setattr(keys.os, "kill", lambda pid, _number: killed.append(pid))
+    monkeypatch.setattr(os, "kill", lambda pid, _number: killed.append(pid))
     with pytest.raises(SernError, match="is not on this machine; reload it with: sudo systemctl reload sern-relay"):
         keys.Running("http://127.0.0.1:1", "sern-relay").reload()
     assert killed == []
