@@ -16,6 +16,7 @@ from sern_client.connection import Connection
 from sern_client.transport import RelayTransport
 from sern_core.path.lanes import LANE_NAMES
 from sern_core.site.client import ClientCore
+from sern_core.vocabulary.key_news import RelayKeys
 from sern_core.vocabulary.message import Message, StreamInfo
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
 from sern_core.vocabulary.types import ClientName, DropReason
@@ -39,6 +40,8 @@ class IdleSite:
     def lane_offered(self, parameters: framing.Envelope) -> None: ...
 
     def lane_closed(self) -> None: ...
+
+    def keys_told(self, keys: RelayKeys) -> None: ...
 
     def rejected(self, code: str, text: str) -> None: ...
 
@@ -154,6 +157,8 @@ class Member(IdleSite):
 
     def lane_closed(self) -> None:
         self.connection.lane_closed()
+
+    def keys_told(self, keys: RelayKeys) -> None: ...
 
 
 @contextmanager

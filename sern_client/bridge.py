@@ -17,6 +17,7 @@ from sern_core.site.client import ClientCore, ClientEvents
 from sern_core.site.services import parse as parse_service
 from sern_core.topics.rules import Discovery
 from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.key_news import RelayKeys
 from sern_core.vocabulary.message import Message, StreamInfo
 from sern_core.vocabulary.types import DropReason
 from sern_core.wire import framing
@@ -34,6 +35,8 @@ class Shell(Protocol):
     def lane_offered(self, parameters: framing.Envelope) -> None: ...
 
     def lane_closed(self) -> None: ...
+
+    def keys_told(self, keys: RelayKeys) -> None: ...
 
     def fault(self, error: Exception) -> None: ...
 
@@ -106,6 +109,9 @@ class Bridge:
 
     def lane_closed(self) -> None:
         self._shell.lane_closed()
+
+    def keys_told(self, keys: RelayKeys) -> None:
+        self._shell.keys_told(keys)
 
     def fault(self, error: Exception) -> None:
         self._shell.fault(error)

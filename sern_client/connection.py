@@ -39,11 +39,18 @@ _log = logging.getLogger(__name__)
 class Connection:
     """Joins a core to its relay: `open` once, then any calls, then `close`, which is safe at any time.
 
-    `on_down` is told why the stream is down. What is None is not open: not yet, or not wanted, or not possible here.
+    `on_down` is told why the stream is down, `on_refused` that the relay does not know our key. What is None is not
+    open: not yet, or not wanted, or not possible here.
     """
 
     def __init__(
-        self, core: ClientCore, relay: RelayConnection, link: LinkSection, *, on_down: Callable[[str], None]
+        self,
+        core: ClientCore,
+        relay: RelayConnection,
+        link: LinkSection,
+        *,
+        on_down: Callable[[str], None],
+        on_refused: Callable[[], None] = lambda: None,
     ) -> None:
         self.transport: RelayTransport | None = None
         self.lane: ClientLane | None = None
@@ -54,6 +61,7 @@ class Connection:
         self._relay = relay
         self._link = link
         self._on_down = on_down
+        self._on_refused = on_refused
         self._linger_s = 0.0
 
     def open(self, ctx: "zmq.Context[zmq.Socket[bytes]]", keys: CurvePair | None, server_keys: Sequence[str]) -> None:
@@ -69,6 +77,7 @@ class Connection:
             handshake_interval_s=relay.handshake_interval_s,
             random=Random(secrets.randbits(64)),
             on_reason=self._on_down,
+            on_refused=self._on_refused,
             after=self.wake,
             marks=marks,
         )
@@ -83,6 +92,13 @@ class Connection:
             self.priority_lane = ClientPriorityLane(
                 self._core, self.transport, link.redundancy, datagrams=self.lane is not None, kick=self.wake
             )
+
+    def use(self, keys: CurvePair, server_keys: Sequence[str], *, redial: bool) -> None:
+        """Other keys from now on; `redial`: the stream at once, too. What is of the session stays."""
+        if self.transport is not None:
+            self.transport.use(keys, server_keys)
+            if redial:
+                self.transport.dialer.redial("the key is changed")
 
     @property
     def waiting(self) -> bool:

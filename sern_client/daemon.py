@@ -32,6 +32,7 @@ from sern_client.endpoints.base import (
 from sern_client.endpoints.composite import with_services
 from sern_client.factory import local_encoding, make_endpoint, make_link_topics
 from sern_client.guard import Guard
+from sern_client.keyring import ClientKeyring, KeyFiles
 from sern_client.link_news import SILENT, LinkNews
 from sern_client.link_state import LinkState
 from sern_client.on_demand import OnDemand
@@ -46,6 +47,7 @@ from sern_core.objects.feed import PERIOD_S
 from sern_core.site.client import ClientCore, ClientEvents
 from sern_core.topics.patterns import PatternSet, compile_pattern
 from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.key_news import ClientKeys, RelayKeys
 from sern_core.vocabulary.message import TopicInfo, TopicSpec
 from sern_core.vocabulary.trace import DecisionTrace
 from sern_core.vocabulary.types import CLASS_LABELS, DropReason, ObjectKind
@@ -55,7 +57,6 @@ from sern_runtime.adaptation import Adaptation
 from sern_runtime.codec_pool import CodecPool, make_coder
 from sern_runtime.collector import CollectorWatch
 from sern_runtime.config.client import ClientFile, ServicesSection, load_client
-from sern_runtime.config.keys import load_secret, load_server_keys
 from sern_runtime.config.load import Loaded
 from sern_runtime.durable.keeper import Keeper, Stored
 from sern_runtime.durable.store import Store
@@ -89,6 +90,7 @@ async def run_client(path: Path, shutdown: Shutdown) -> int:
     try:
         await daemon.start()
         daemon.collector.settle()
+        shutdown.on_reload = daemon.reload
         await serve(shutdown, daemon.tasks)
         daemon.notifier.stopping("draining")
         await daemon.drain()
@@ -167,7 +169,10 @@ class ClientDaemon:
             if self.scene is not None:
                 endpoint.show_scene(self.scene)
         self.check = TableCheck(Tables(self.bridge, self.link_state, self.scene), now=now)
-        self.connection = Connection(self.core, model.relay, model.link, on_down=self.link_down)
+        self.keyring = self._make_keyring()
+        self.connection = Connection(
+            self.core, model.relay, model.link, on_down=self.link_down, on_refused=self._key_refused
+        )
         self.bridge.inbound.subscribed.begin(model.subscribe_patterns())
         self.core.subscribe_objects(model.object_selections(), now=now)
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
@@ -209,6 +214,31 @@ class ClientDaemon:
         """How a topic of this site is treated, by its global name."""
         name = self.site.rules.inward(info.name, namespace=self.site.namespace)
         return self.site.rules.resolve(replace(info, name=name), local_name=name).spec
+
+    def _make_keyring(self) -> ClientKeyring | None:
+        relay = self.loaded.model.relay
+        if relay.secret_key_file is None or relay.server_key_file is None:
+            return None
+        files = KeyFiles(self.loaded.resolve(relay.secret_key_file), self.loaded.resolve(relay.server_key_file))
+        return ClientKeyring(files, use=self._use_keys, tell=self._tell_keys, at_s=time.time)
+
+    def _use_keys(self, redial: bool) -> None:
+        if self.keyring is not None:
+            self.connection.use(self.keyring.keys, self.keyring.server_keys, redial=redial)
+
+    def _tell_keys(self, keys: ClientKeys) -> None:
+        if self.core.link.established:
+            self.core.tell_keys(keys, now=clock.now())
+            self._kick()
+
+    def _key_refused(self) -> None:
+        if self.keyring is not None:
+            self.keyring.refused()
+
+    def reload(self) -> None:
+        """SIGHUP: read the keys anew."""
+        if self.keyring is not None:
+            self.keyring.reload()
 
     def _make_goals(self) -> GoalWatch | None:
         sections = self.loaded.model.actions.use
@@ -267,10 +297,8 @@ class ClientDaemon:
         ros_types.load()
         model = self.loaded.model
         relay = model.relay
-        keys = load_secret(self.loaded.resolve(relay.secret_key_file)) if relay.secret_key_file else None
-        server_keys: tuple[str, ...] = ()
-        if relay.server_key_file:
-            server_keys = load_server_keys(self.loaded.resolve(relay.server_key_file), at_s=time.time())
+        if self.keyring is not None:
+            self.keyring.read()
         if model.http.listen is not None:
             with blamed_on(self.loaded.path, "http", "listen"):
                 self._http = self._make_http(model.http.listen)
@@ -287,7 +315,10 @@ class ClientDaemon:
             self.guard.start()
         self._ctx = zmq.Context()
         with blamed_on(self.loaded.path, "relay", "endpoint"):
-            self.connection.open(self._ctx, keys, server_keys)
+            if self.keyring is None:
+                self.connection.open(self._ctx, None, ())
+            else:
+                self.connection.open(self._ctx, self.keyring.keys, self.keyring.server_keys)
         self.tasks.append(asyncio.create_task(self._tick(), name="client-tick"))
         self.tasks.append(asyncio.create_task(self._tell_objects(), name="client-objects"))
         if self.scene is not None:
@@ -305,7 +336,13 @@ class ClientDaemon:
 
     # --- Shell: what becomes of the link ------------------------------------------------------------------------------
 
+    def keys_told(self, keys: RelayKeys) -> None:
+        if self.keyring is not None:
+            self.keyring.told(keys)
+
     def link_down(self, reason: str) -> None:
+        if self.keyring is not None and not self.core.link.established:
+            self.keyring.session_ended()
         self.link_state.soon()
         self.news.down(reason)
 
@@ -334,6 +371,8 @@ class ClientDaemon:
                 with self.parts.survive("message_log"):
                     self.message_log.flush()
             self.connection.tick()
+            if self.keyring is not None:
+                self.keyring.look()
             self.check.tick(now=clock.now())
             self.link_state.look()
             self.bridge.outbound.leaving.look(now=clock.now())
@@ -416,6 +455,7 @@ class ClientDaemon:
             ready=self.readiness,
             json_routes={
                 **self.views.routes(),
+                "/api/keys": lambda: {} if self.keyring is None else self.keyring.to_json(),
                 **({} if self.scene is None else {"/api/scene": self.scene.to_json}),
                 **({} if adaptation is None else {"/api/mmcf": adaptation.view()}),
                 **(self.site.endpoint.json_routes if isinstance(self.site.endpoint, ServedEndpoint) else {}),
@@ -499,6 +539,8 @@ class ClientDaemon:
             if self.bridge.services is not None:
                 stack.push_async_callback(self.bridge.services.stop)
             stack.callback(self.connection.close)
+            if self.keyring is not None:
+                stack.push_async_callback(self.keyring.close)
             stack.callback(self.codecs.close)
             stack.push_async_callback(end_tasks, self.tasks)
 

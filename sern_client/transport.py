@@ -5,6 +5,7 @@ import logging
 from collections.abc import Callable, Sequence
 from random import Random
 from typing import Final, Protocol
+from weakref import WeakSet
 
 import zmq
 
@@ -71,14 +72,17 @@ class Dialer:
         self._keys = keys
         self._server_keys = tuple(server_keys)
         self._events = events
+        self._made_with: tuple[CurvePair | None, str | None] = keys, None
         self._was_up = False
+        self._refusing = False
+        """Whether its owner is being told that the relay does not know our key: another attempt follows anyway."""
         self._handshake_ivl_ms = int(handshake_interval_s * 1000)
         self._heartbeat_timeout_ms = int(heartbeat_timeout_s * 1000)
         self._random = random
         self._priority_lane = priority_lane
         self._tos = tos
         self._backoff_s = REBUILD_MIN_S
-        self._rebuild: asyncio.TimerHandle | None = None
+        self._rebuild: asyncio.Handle | None = None
         self._socket: DealerSocket | None = None
         self._watch: TransportWatch | None = None
         self._handle: TcpHandle | None = None
@@ -95,11 +99,13 @@ class Dialer:
         def attach(socket: "zmq.Socket[bytes]") -> None:
             self._watch = TransportWatch(socket, self._up, self._down, self._refused, self._give_up)
 
+        server_key = self._server_keys[self.attempt % len(self._server_keys)] if self._server_keys else None
+        self._made_with = self._keys, server_key
         raw = make_client(
             self._ctx,
             self._endpoint,
             self._keys,
-            self._server_keys[self.attempt % len(self._server_keys)] if self._server_keys else None,
+            server_key,
             heartbeat_timeout_ms=self._heartbeat_timeout_ms,
             max_message_bytes=LANE_MESSAGE_BYTES,
             handshake_ivl_ms=self._handshake_ivl_ms,
@@ -110,6 +116,20 @@ class Dialer:
             raw, self._events.received, on_view=self._events.received, on_writable=self._events.writable
         )
         self._inflow = Inflow(self._socket, self._taken, self._endless)
+
+    def use(self, keys: CurvePair | None, server_keys: Sequence[str]) -> None:
+        """Other keys, for the sockets that are made from now on. One that was made with keys that are over is kept
+        while it is connected, and made anew when it is not: libzmq would try them for ever."""
+        if self._server_keys != tuple(server_keys):
+            self.attempt = 0
+        self._keys, self._server_keys = keys, tuple(server_keys)
+        if self._socket is not None and self._stale and not self._was_up and not self._refusing:
+            self.again("other keys are used")
+
+    @property
+    def _stale(self) -> bool:
+        keys, server_key = self._made_with
+        return keys != self._keys or (server_key is not None and server_key not in self._server_keys)
 
     def _reopen(self) -> None:
         self._rebuild = None
@@ -162,12 +182,14 @@ class Dialer:
 
     def _down(self, reason: str) -> None:
         self._events.down(reason)
-        if len(self._server_keys) > 1 and not self._was_up:
+        if self._stale or (len(self._server_keys) > 1 and not self._was_up):
             self.again(reason)  # the relay may have another of the keys it announced
         self._was_up = False
 
     def _refused(self, reason: str) -> None:
+        self._refusing = True
         self._events.refused(reason)
+        self._refusing = False
         self._give_up(reason)
 
     def _give_up(self, reason: str) -> None:
@@ -178,19 +200,29 @@ class Dialer:
         """Make a new socket after a jittered pause: libzmq does not try this one again."""
         if self._rebuild is not None:
             return
-        self.rebuilds += 1
         self.attempt += 1
+        self._replace(reason, delay_s * (1 + 0.5 * self._random.random()))
+
+    def redial(self, reason: str) -> None:
+        """Make a new socket at once, with the keys that are to be used by now."""
+        if self._rebuild is not None:
+            self._rebuild.cancel()
+        self._replace(reason, 0.0)
+
+    def _replace(self, reason: str, delay_s: float) -> None:
+        self.rebuilds += 1
         self._events.given_up(reason)
         loop = asyncio.get_running_loop()
         loop.call_soon(self._shut)
-        self._rebuild = loop.call_later(delay_s * (1 + 0.5 * self._random.random()), self._reopen)
+        # In this order also without a pause: the old one goes before the new one comes.
+        self._rebuild = loop.call_later(delay_s, self._reopen) if delay_s else loop.call_soon(self._reopen)
 
 
 class RelayTransport:
     """Joins `link` to `endpoint`; with several `server_keys` (a rotation) they are tried in turn.
 
-    `on_reason` is told why the transport is down; `after` is called when the link has something to send, which may be
-    for another lane.
+    `on_reason` is told why the transport is down, `on_refused` that the relay does not know our key; `after` is called
+    when the link has something to send, which may be for another lane.
     """
 
     def __init__(
@@ -205,6 +237,7 @@ class RelayTransport:
         handshake_interval_s: float = HANDSHAKE_IVL_MS / 1000,
         random: Random,
         on_reason: Callable[[str], None],
+        on_refused: Callable[[], None] = lambda: None,
         after: Callable[[], None] = lambda: None,
         marks: Marks | None = None,
     ) -> None:
@@ -214,13 +247,17 @@ class RelayTransport:
         self.endpoint = endpoint
         self.bad_frames = 0
         self._on_reason = on_reason
+        self._on_refused = on_refused
+        self._keys = keys
+        self._server_keys = tuple(server_keys)
+        self._others: WeakSet[Dialer] = WeakSet()
 
         def dial(events: DialerEvents, *, priority_lane: bool = False, attempt: int = 0) -> Dialer:
             return Dialer(
                 ctx,
                 endpoint,
-                keys,
-                server_keys,
+                self._keys,
+                self._server_keys,
                 events,
                 heartbeat_timeout_s=heartbeat_timeout_s,
                 handshake_interval_s=handshake_interval_s,
@@ -246,7 +283,15 @@ class RelayTransport:
 
     def another(self, events: DialerEvents) -> Dialer:
         """Another connection to the same relay, for class control, not opened yet."""
-        return self._dial(events, priority_lane=True, attempt=self.dialer.attempt)
+        other = self._dial(events, priority_lane=True, attempt=self.dialer.attempt)
+        self._others.add(other)
+        return other
+
+    def use(self, keys: CurvePair | None, server_keys: Sequence[str]) -> None:
+        """Other keys, for every connection that is made from now on."""
+        self._keys, self._server_keys = keys, tuple(server_keys)
+        for dialer in (self.dialer, *self._others):
+            dialer.use(keys, server_keys)
 
     def close(self, *, linger_s: float = 0.0) -> None:
         """What was sent may take `linger_s` to leave."""
@@ -267,6 +312,7 @@ class RelayTransport:
 
     def refused(self, reason: str) -> None:
         """Then not by another lane either."""
+        self._on_refused()
         self.link.close(reason, now=clock.now())
 
     def given_up(self, reason: str) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from sern_core.vocabulary.types import ClientName
-from sern_runtime.config.keys import KeyDirectory, KeyStatus, clock_says, user_id
+from sern_runtime.config.keys import KeyDirectory, KeyStatus, clock_says, fingerprint, user_id
 from sern_runtime.zap import Refusal, TemporaryRefusal
 
 ZAP_DOMAIN: Final = "sern"
@@ -54,13 +54,22 @@ class Admission:
             return None
         if match.status is KeyStatus.VALID:
             return user_id(match.name, public_key)
+        if match.status is KeyStatus.REVOKED:
+            return Refusal(f"the key {fingerprint(public_key)} of {match.name} is revoked")
         refusal = TemporaryRefusal if match.status is KeyStatus.NOT_YET else Refusal
-        return refusal(f"the key of {match.name} {match.key.lapse(at_s)}, and {clock_says(at_s)}")
+        return refusal(
+            f"the key {fingerprint(public_key)} of {match.name} {match.key.lapse(at_s)}, and {clock_says(at_s)}"
+        )
 
-    def take_lapsed(self) -> list[ClientName]:
-        """The clients of which a key was taken away or has expired since this was last asked."""
+    def take_lapsed(self) -> dict[ClientName, frozenset[str]]:
+        """The keys that were taken away or have expired since this was last asked, by client."""
         before, self._valid = self._valid, self._valid_keys()
-        return [client for client, keys in before.items() if keys - self._valid.get(client, frozenset())]
+        lost = {client: keys - self._valid.get(client, frozenset()) for client, keys in before.items()}
+        return {client: keys for client, keys in lost.items() if keys}
+
+    def valid(self) -> dict[ClientName, frozenset[str]]:
+        """The keys that held when it was last looked, by client."""
+        return self._valid
 
     def _valid_keys(self) -> dict[ClientName, frozenset[str]]:
         """The keys that hold now, by client."""

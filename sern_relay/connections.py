@@ -59,6 +59,10 @@ class ClientConnections:
         """Those that are for sessions."""
         return ((each, each.served) for each in self._by_id.values() if each.served is not None)
 
+    def all(self) -> list[ClientConnection]:
+        """Each of them, of either kind."""
+        return list(self._by_id.values())
+
     def for_control(self) -> list[ClientConnection]:
         """Those for class control alone."""
         return [each for each in self._by_id.values() if each.served is None]

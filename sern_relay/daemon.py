@@ -20,12 +20,14 @@ from sern_core.relay.traces import Traces
 from sern_core.stream.out_channel import OutChannel
 from sern_core.topics.rules import FeedRole
 from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.key_news import ClientKeys
 from sern_core.vocabulary.message import Message, StreamInfo
 from sern_core.vocabulary.types import ClientName
 from sern_relay.admission import ZAP_DOMAIN, Admission, read_directory
 from sern_relay.comings import Comings
 from sern_relay.durable import DurableHolding
 from sern_relay.feed import RelayFeed
+from sern_relay.keyring import OwnKeys, RelayKeyring
 from sern_relay.readers import Readers
 from sern_relay.refusals import Refusals
 from sern_relay.relay_metrics import register_relay
@@ -38,7 +40,7 @@ from sern_runtime import clock, ros_types
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.codec_pool import CodecPool, make_coder
 from sern_runtime.collector import CollectorWatch
-from sern_runtime.config.keys import KeyDirectory, load_secret
+from sern_runtime.config.keys import KeyDirectory, fingerprint
 from sern_runtime.config.load import Loaded
 from sern_runtime.config.relay import RelayFile, load_relay
 from sern_runtime.datagram_watch import DatagramWatch
@@ -152,6 +154,7 @@ class RelayDaemon:
             self.durable = self._make_durable(loaded.resolve(model.durable.directory), model.durable.max_bytes)
         self.zap: ZapHandler | None = None
         self.server: RelayServer | None = None
+        self.keyring: RelayKeyring | None = None
         self.lanes: RelayLanes | None = None
         self.datagrams = DatagramWatch(
             lambda: list(self.hub.links.values()),
@@ -179,13 +182,19 @@ class RelayDaemon:
         known, after = self.admission.known, self._after
         return DurableHolding(store, keeper, self.hub, known=known, now=clock.now, after=after)
 
+    def _own_keys(self) -> OwnKeys | None:
+        """The relay's own keys as its files say now. Raises ConfigError."""
+        file = self.loaded.model.relay.secret_key_file
+        return None if file is None else OwnKeys.read(self.loaded.resolve(file))
+
     async def start(self) -> None:
         self.errors.watch(asyncio.get_running_loop())
         self.collector.watch()
         ros_types.load()
         model = self.loaded.model
         relay = model.relay
-        keys = load_secret(self.loaded.resolve(relay.secret_key_file)) if relay.secret_key_file else None
+        own = self._own_keys()
+        keys = None if own is None else own.now
         if model.http.listen is not None:
             with blamed_on(self.loaded.path, "http", "listen"):
                 self._http = self._make_http(model.http.listen)
@@ -195,9 +204,17 @@ class RelayDaemon:
                 self.durable.start()
         self._ctx = zmq.Context()
         self.readers.transforms = TransformObjects(self.hub.objects, parts=self.parts)
-        if keys is not None:
+        if own is not None:
             self.zap = ZapHandler(self._ctx, refused=self.turned_away.refuse)
             self.zap.add_domain(ZAP_DOMAIN, self.admission.lookup)
+            self.keyring = RelayKeyring(
+                self.hub,
+                self.admission,
+                own,
+                overlap_s=relay.overlap_s,
+                session_key=lambda client: self.server.session_key(client) if self.server is not None else None,
+                after=self._after,
+            )
         with blamed_on(self.loaded.path, "relay", "listen"):
             self.server = RelayServer(
                 self._ctx,
@@ -243,16 +260,18 @@ class RelayDaemon:
         )
 
     def _end_lapsed(self) -> None:
-        """Cut the connections of every client of which a key was taken away or has expired; one with a key that still
-        holds is back at once. Whose those are that have not said anything yet is not known: they go, too."""
+        """Cut the connections that were made with a key that was taken away or has expired. A session that another
+        connection holds by now goes on. Whose those are that have not said anything yet is not known: they go, too."""
         lapsed = self.admission.take_lapsed()
         if not lapsed or self.server is None:
             return
         self.server.cut_unbound()
-        for client in lapsed:
-            cut = self.server.cut_client(client)
+        for client, keys in lapsed.items():
+            stays = self.server.session_key(client) in self.admission.valid().get(client, frozenset())
+            cut = self.server.cut_keys(client, keys) if stays else self.server.cut_client(client)
             self.events.say(_log, logging.WARNING, "key_lost", client, "%s lost a key; %d connections cut", client, cut)
-            self.hub.clients.end_session(client, "the key no longer holds", now=clock.now())
+            if not stays:
+                self.hub.clients.end_session(client, "the key no longer holds", now=clock.now())
 
     def _after(self) -> None:
         """Something came in: before the loop comes round again, whoever has something to send sends it."""
@@ -334,6 +353,7 @@ class RelayDaemon:
             loaded = load_relay(self.loaded.path)
             directory = self._directory(loaded)
             access = AccessTable(loaded.model.access_rules())
+            own = self._own_keys()
         except ConfigError as error:
             self.reloads.failed(str(error), now=clock.now())
             self.events.say(
@@ -348,6 +368,8 @@ class RelayDaemon:
         self.hub.revoke(access, now=now)
         with self.parts.survive("feed"):
             self._update_feed(loaded.model, now)
+        if own is not None:
+            self._use_keys(own, loaded.model)
         if self.server is not None:
             self.server.cut_unbound()  # admitted by the old keys, and silent so far
         self._end_lapsed()
@@ -362,6 +384,15 @@ class RelayDaemon:
         self._in_force(now)
         words = "reloaded keys, access rules and feed roles; other changes need a restart"
         self.events.say(_log, logging.INFO, "reloaded", "", words)
+
+    def _use_keys(self, own: OwnKeys, model: RelayFile) -> None:
+        """What the relay proves itself with from now on, and what clients are told of it."""
+        if self.keyring is None or self.server is None:
+            return
+        if own.now != self.keyring.own.now:
+            self.server.rekey(own.now, ZAP_DOMAIN)
+            _log.warning("the relay has a new key, %s: clients connect anew", fingerprint(own.now.public_key))
+        self.keyring.use(own, overlap_s=model.relay.overlap_s)
 
     def _in_force(self, now: float) -> None:
         failed_s = self.reloads.take_recovery_s(now=now)
@@ -381,7 +412,10 @@ class RelayDaemon:
             registry,
             health=lambda: Health(ok=True, reason="running"),
             ready=self.readiness,
-            json_routes=self.views.routes(self.adaptation),
+            json_routes={
+                **self.views.routes(self.adaptation),
+                "/api/keys": lambda: {} if self.keyring is None else self.keyring.to_json(),
+            },
             parts=self.parts,
         )
 
@@ -459,6 +493,8 @@ class RelayDaemon:
             stack.callback(self.codecs.close)
             if self.durable is not None:
                 stack.callback(self.durable.close)
+            if self.keyring is not None:
+                stack.push_async_callback(self.keyring.close)
             stack.callback(self._cancel_flush)
             stack.push_async_callback(end_tasks, self.tasks)
 
@@ -489,11 +525,21 @@ class RelayDaemon:
         if self.lanes is not None:
             self.lanes.closed(client)
 
+    def keys_asked(self, client: ClientName) -> None:
+        if self.keyring is not None:
+            self.keyring.asked(client)
+
+    def keys_told(self, client: ClientName, keys: ClientKeys) -> None:
+        if self.keyring is not None:
+            self.keyring.told(client, keys)
+
     def fault(self, client: ClientName | None, error: Exception) -> None:
         self.errors.core(error, client or "")
 
     def client_down(self, client: ClientName, reason: str) -> None:
         self._comings.down(client, reason)
+        if self.keyring is not None:
+            self.keyring.left(client)
 
     def stream_added(self, stream: StreamInfo) -> None:
         _log.info("%s announces %s (%s)", stream.id.origin, stream.id.topic, stream.info.type_name)

@@ -7,6 +7,7 @@ from sern_core.bodies.codecs import Coder
 from sern_core.relay.hub import Hub
 from sern_relay.durable import DurableHolding
 from sern_relay.feed import RelayFeed
+from sern_relay.keyring import RelayKeyring
 from sern_relay.readers import Readers
 from sern_relay.reload_state import ReloadState
 from sern_relay.server import RelayServer
@@ -34,6 +35,7 @@ class Counting(Protocol):
     adaptation: Adaptation | None
     server: RelayServer | None
     zap: ZapHandler | None
+    keyring: RelayKeyring | None
     readers: Readers
     reloads: ReloadState
     durable: DurableHolding | None
@@ -77,6 +79,8 @@ def register_relay(metrics: Metrics, relay: Counting) -> None:
                     read=lambda: [((), float(relay.server.bad_frames if relay.server else 0))])  # fmt: skip
     metrics.counter("sern_relay_auth_total", "Answers of the ZAP handler.", ("result",),
                     lambda: _auth(relay.zap))  # fmt: skip
+    metrics.counter("sern_relay_new_keys_total", "Further keys that clients have offered for themselves.", ("result",),
+                    lambda: _new_keys(relay.keyring))  # fmt: skip
     metrics.gauge("sern_relay_connections", "Connections, those without a proven key included.",
                   read=lambda: [((), float(len(relay.server.connections) if relay.server else 0))])  # fmt: skip
     metrics.counter("sern_relay_connections_refused_total", "Connections or messages refused, by reason.",
@@ -98,6 +102,11 @@ def register_relay(metrics: Metrics, relay: Counting) -> None:
 def _auth(zap: ZapHandler | None) -> list[tuple[tuple[str, ...], float]]:
     names = ("admitted", "unknown_key", "not_now", "capped", "failed", "malformed")
     return [((name,), float(getattr(zap.counters, name)) if zap else 0.0) for name in names]
+
+
+def _new_keys(keyring: RelayKeyring | None) -> list[tuple[tuple[str, ...], float]]:
+    counts = (0, 0) if keyring is None else (keyring.taken, keyring.refused)
+    return [(("taken",), float(counts[0])), (("refused",), float(counts[1]))]
 
 
 def refused_connections(server: RelayServer | None) -> list[tuple[tuple[str, ...], float]]:

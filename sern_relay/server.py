@@ -8,7 +8,7 @@ import zmq
 
 from sern_core.relay.hub import Hub
 from sern_core.relay.hub_port import HubPort
-from sern_core.vocabulary.errors import RemoteError, UsageError, WireError
+from sern_core.vocabulary.errors import ConfigError, RemoteError, UsageError, WireError
 from sern_core.vocabulary.names import client_name
 from sern_core.vocabulary.params import Redundancy
 from sern_core.vocabulary.types import ClientName
@@ -16,12 +16,12 @@ from sern_core.wire import framing
 from sern_relay.connections import ClientConnection, ClientConnections, Served
 from sern_relay.priority_lanes import JOIN, RelayPriorityLanes
 from sern_runtime import clock
-from sern_runtime.config.keys import KeyStatus, parse_user_id
+from sern_runtime.config.keys import KeyStatus, parse_user_id, user_id
 from sern_runtime.dscp import Marks
 from sern_runtime.inflow import Inflow
 from sern_runtime.monitor import ConnectionTable, TcpHandle
 from sern_runtime.pump import LANE_MESSAGE_BYTES, Pump
-from sern_runtime.zmq_setup import CurvePair, make_server
+from sern_runtime.zmq_setup import CurvePair, bind_all, make_server, serve_curve, unbind
 from sern_runtime.zmq_socket import RouterSocket, SendResult
 
 MAX_PORTS: Final = 4
@@ -30,10 +30,13 @@ a change of network left behind. Those for class control alone are bounded by `R
 SILENT_INTERVALS: Final = 2.0
 """Times `handshake_interval_s` until a connection must have spoken: once for the handshake, and once for what is said
 right after it."""
+UNBIND_S: Final = 1.0
+"""How long libzmq may take to let go of an address; it does so within some milliseconds."""
 MAX_TOLD: Final = 1024
 """Clients of which is logged, once each, that they have too many connections."""
 REFUSED_KEY: Final = {
     KeyStatus.UNKNOWN: "is revoked",
+    KeyStatus.REVOKED: "is revoked",
     KeyStatus.EXPIRED: "has expired",
     KeyStatus.NOT_YET: "is not valid yet",
 }
@@ -81,6 +84,8 @@ class RelayServer:
         self._key_status = key_status
         self._marks = marks or Marks()
         self._insecure = keys is None
+        self._listen = listen
+        self._to_bind: tuple[str, ...] = ()
         self._after = after
         raw = make_server(
             ctx,
@@ -205,6 +210,7 @@ class RelayServer:
     def look(self) -> None:
         """See to connections. Call about once a second."""
         self.silent += self.connections.cut_silent(self._silent_s)
+        self._bind()
         self.priority_lanes.look()
 
     def _send(self, routing_id: bytes, datagram: bytes) -> SendResult:
@@ -262,6 +268,48 @@ class RelayServer:
         # A session is told of before it has its connection: that is then the newest of the client.
         own = [served.port.address for connection, served in self.clients.sessions() if connection.client == client]
         return own[-1] if own else ""
+
+    def session_key(self, client: ClientName) -> str | None:
+        """The key (Z85) of the connection that has the client's session; None while it has none."""
+        for connection, served in self.clients.sessions():
+            if connection.client == client and served.port.current:
+                return None if self._insecure else parse_user_id(connection.user)[1]
+        return None
+
+    def cut_keys(self, client: ClientName, keys: frozenset[str]) -> int:
+        """End the connections of a client that were made with one of these keys; returns how many there were."""
+        users = {user_id(client, key) for key in keys}
+        gone = [each for each in self.clients.all() if each.user in users]
+        for connection in gone:
+            self._gone(connection)
+            self.connections.cut(connection.fd)
+        return len(gone)
+
+    def rekey(self, keys: CurvePair, zap_domain: str) -> None:
+        """Prove the relay's identity with other keys from now on.
+
+        libzmq copies the keys of a socket when it binds: so it is bound anew. That ends the connections that there are,
+        and clients come back by themselves; sessions with a datagram lane go on meanwhile.
+        """
+        raw = self.socket.socket
+        serve_curve(raw, keys, zap_domain)
+        for endpoint in self._listen:
+            self.connections.unbound = False
+            unbind(raw, endpoint)
+            self.connections.await_unbound(clock.now() + UNBIND_S)
+        self._to_bind = self._listen
+        self._bind()
+
+    def _bind(self) -> None:
+        """Listen again where the relay has let go of its addresses; what another process has taken is tried again."""
+        for endpoint in self._to_bind:
+            try:
+                bind_all(self.socket.socket, (endpoint,))
+            except ConfigError as error:
+                if len(self._to_bind) == len(self._listen):
+                    _log.error("%s; trying again", error)
+                return
+            self._to_bind = self._to_bind[1:]
 
     def cut_client(self, client: str) -> int:
         """End every connection of a client at once; returns how many there were."""

@@ -58,6 +58,7 @@ fit into it."""
 RTO_MAX_MS: Final = 1000
 """Bounds the kernel's backoff in a blackout: a fresh pose 0.65 s after 30 s without a link, instead of 7.1 s."""
 
+_CRYPTOGRAPHIC: Final = 0x11000001  # ZMQ_PROTOCOL_ERROR_ZMTP_CRYPTOGRAPHIC
 _log = logging.getLogger(__name__)
 _monitor_numbers = count(1)
 _EVENT: Final = struct.Struct("=HI")
@@ -395,6 +396,8 @@ class ConnectionTable:
         self.accepted = 0
         self.accept_failed = 0
         self.handshake_failed = 0
+        self.forged = 0
+        """Those of them in which what was sealed did not open: for another server's key, or made up."""
         self.max_half_open_per_source = max_half_open_per_source
         self.max_half_open = max_half_open
         self.max_connections = max_connections
@@ -505,6 +508,7 @@ class ConnectionTable:
                 pass
             case _:
                 self.handshake_failed += 1
+                self.forged += event.value == _CRYPTOGRAPHIC
         if self._on_change is not None:
             self._on_change()
 

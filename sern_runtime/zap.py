@@ -23,6 +23,7 @@ from zmq.utils import z85
 
 from sern_core.vocabulary.errors import ConfigError, SernError, UsageError
 from sern_runtime.addresses import plain_host
+from sern_runtime.config.keys import fingerprint
 from sern_runtime.monitor import EventKind, MonitorEvent, SocketMonitor
 from sern_runtime.zmq_setup import connect_curve
 from sern_runtime.zmq_socket import DealerSocket, FrameSocket
@@ -160,7 +161,8 @@ class ZapHandler:
             return b"400", b"no such key", b""
         if isinstance(answer, Refusal) or not answer:
             counters.unknown_key += 1
-            why = answer.reason if isinstance(answer, Refusal) else f"unknown key {public_key}"
+            unknown = f"unknown key {public_key} (fingerprint {fingerprint(public_key)})"
+            why = answer.reason if isinstance(answer, Refusal) else unknown
             self._refused(address, public_key, why)
             return b"400", b"no such key", b""
         if isinstance(answer, TemporaryRefusal):

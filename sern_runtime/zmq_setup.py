@@ -97,6 +97,11 @@ def bind_all(socket: "zmq.Socket[bytes]", endpoints: Sequence[str]) -> tuple[str
     return tuple(bound)
 
 
+def unbind(socket: "zmq.Socket[bytes]", endpoint: str) -> None:
+    """Let go of an endpoint, as it was given to `bind_all`: libzmq knows a wildcard under another name by then."""
+    socket.unbind(endpoint.replace("tcp://*:", "tcp://[::]:"))
+
+
 def _bind_problem(error: zmq.ZMQError) -> str:
     match error.errno:
         case zmq.EADDRINUSE:

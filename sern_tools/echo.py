@@ -32,6 +32,7 @@ from sern_client.transport import RelayTransport
 from sern_core.link.handshake import DISPLACED, NEW_SESSION
 from sern_core.site.client import ClientCore
 from sern_core.vocabulary.errors import ConfigError, RefusedError, SernError, UsageError
+from sern_core.vocabulary.key_news import RelayKeys
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo
 from sern_core.vocabulary.names import client_name, name_problem
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
@@ -240,6 +241,9 @@ class Listener:
 
     def lane_closed(self) -> None:
         """There is none."""
+
+    def keys_told(self, keys: RelayKeys) -> None:
+        """Whoever looks has the daemon's keys, and leaves them to it."""
 
     def rejected(self, code: str, text: str) -> None:
         if code == DISPLACED:  # the guest gives way

@@ -32,11 +32,12 @@ def run_keygen(role: Role, name: str, *, out: Path = Path(), force: bool = False
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"can not be made: {error.strerror or error}", file=str(out)) from error
-    write_pair(owner, out, out, replace=force)
+    pair = write_pair(owner, out, out, replace=force)
     advice = _relay_advice if role == "relay" else _client_advice
-    return f"wrote {secret_path} (secret, mode 0600) and {public_path} (public)\n" + advice(
-        name, secret_path, public_path
-    )
+    return (
+        f"wrote {secret_path} (secret, mode 0600) and {public_path} (public)\n"
+        f"fingerprint {keys.fingerprint(pair.public_key)}\n"
+    ) + advice(name, secret_path, public_path)
 
 
 def write_pair(name: ClientName, directory: Path, public_directory: Path, *, replace: bool = False) -> keys.SecretKey:

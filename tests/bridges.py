@@ -8,6 +8,7 @@ from sern_client.endpoints.base import Difference, Held, Sink, TopicEvents
 from sern_client.site import Site
 from sern_core.site.client import ClientCore, ClientEvents
 from sern_core.topics.rules import Discovery, DiscoveryMode, RuleSet, TopicRule
+from sern_core.vocabulary.key_news import RelayKeys
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
 from sern_core.vocabulary.types import ClientName, Encoding, TopicName
@@ -125,6 +126,9 @@ class Shell:
 
     def lane_closed(self) -> None:
         self.said.append("lane closed")
+
+    def keys_told(self, keys: RelayKeys) -> None:
+        self.said.append(f"keys: {', '.join(keys.relay)}")
 
     def fault(self, error: Exception) -> None:
         self.faults.append(error)

@@ -36,6 +36,9 @@ Vector = dict[str, Any]
 FLAGS: Final = {"TOMBSTONE": framing.FLAG_DROP_MARKER, "REPLAY": framing.FLAG_REPLAY, "URGENT": framing.FLAG_URGENT}
 """The vectors have names of their own for flags, which never change."""
 DEFINITION: Final = "std_msgs/Header header\nfloat64[] ranges\n"
+A_KEY: Final = "rq:rM>}U?@Lns47E1%kR.o@n%FcmmsL/@{H8]yf7"
+ANOTHER_KEY: Final = "Yne@$w-vo<fVvi]a<NY6T1ed:M$fCG*[IaLV{hID"
+"""Of the examples of ZeroMQ's RFC 26 and libzmq's manual, which are nobody's."""
 
 
 # --- meaning to bytes and back ----------------------------------------------------------------------------------------
@@ -409,6 +412,33 @@ def valid() -> list[Vector]:
             "denied-pattern",
             "the relay takes nothing of this subscription",
             {"t": "denied", "pattern": "/(a*)*", "code": "bad_pattern", "why": "it could take too long to match"},
+        ),
+        _control(
+            "subscribe-keys",
+            "and the client is to be told of the relay's keys as well, as clients of this release say it",
+            {"t": "subscribe", "patterns": ["/jackal1/.*"], "more": False, "peers": True, "keys": True},
+        ),
+        _control(
+            "keys",
+            "the relay has a key, and another to come; it takes none of the client's",
+            {"t": "keys", "relay": [A_KEY, ANOTHER_KEY], "takes": False, "key": "", "code": "", "why": ""},
+        ),
+        _control(
+            "keys-refused",
+            "a key that the client has offered is not taken",
+            {
+                "t": "keys",
+                "relay": [A_KEY],
+                "takes": False,
+                "key": ANOTHER_KEY,
+                "code": "forbidden",
+                "why": "this relay takes no keys over the link",
+            },
+        ),
+        _control(
+            "key",
+            "the client accepts both keys of its relay for good, and offers a further one of its own",
+            {"t": "key", "relay": [A_KEY, ANOTHER_KEY], "kept": True, "key": A_KEY},
         ),
         _control(
             "lane-ask",

@@ -22,6 +22,7 @@ from sern_core.stream.decoding import DecodeRequest
 from sern_core.stream.encoding import EncodeRequest
 from sern_core.stream.out_channel import OutChannel
 from sern_core.vocabulary.codec_names import DEFAULT_LOSSY, Compression, LossyParams
+from sern_core.vocabulary.key_news import ClientKeys, RelayKeys
 from sern_core.vocabulary.limits import PeerLimits
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
@@ -251,7 +252,11 @@ class SimClient:
     def lane_offered(self, parameters: framing.Envelope) -> None: ...
 
     def lane_closed(self) -> None:
+        self.keys: list[RelayKeys] = []
         self.lanes_closed += 1
+
+    def keys_told(self, keys: RelayKeys) -> None:
+        self.keys.append(keys)
 
     def rejected(self, code: str, text: str) -> None:
         self.rejections.append((code, text))
@@ -374,6 +379,7 @@ class SimHub:
         self.world = world
         self.clock = world.relay_clock
         self.refusals: list[tuple[str, str]] = []
+        self.client_keys: list[tuple[ClientName, ClientKeys]] = []
         self.fed: list[Message] = []
         self.hub = Hub(
             name=ClientName("relay"),
@@ -418,6 +424,11 @@ class SimHub:
     def lane_asked(self, client: ClientName, ciphers: list[str]) -> None: ...
 
     def lane_closed(self, client: ClientName) -> None: ...
+
+    def keys_asked(self, client: ClientName) -> None: ...
+
+    def keys_told(self, client: ClientName, keys: ClientKeys) -> None:
+        self.client_keys.append((client, keys))
 
     def client_up(self, client: ClientName, *, resumed: bool) -> None: ...
 

@@ -15,6 +15,7 @@ from sern_client.priority_lane import ClientPriorityLane
 from sern_client.transport import RelayTransport
 from sern_client.udp import ClientLane
 from sern_core.site.client import ClientCore
+from sern_core.vocabulary.key_news import RelayKeys
 from sern_core.vocabulary.message import KAPPA, Message, StreamInfo, TopicInfo, TopicSpec
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
 from sern_core.vocabulary.types import ClientName, DropReason, Encoding, PriorityClass, TopicName
@@ -146,6 +147,8 @@ class End:
     def lane_closed(self) -> None:
         if self._lane is not None:
             self._lane.closed()
+
+    def keys_told(self, keys: RelayKeys) -> None: ...
 
     def stream_opened(self, stream: StreamInfo) -> None: ...
 

@@ -40,6 +40,7 @@ from sern_core.stream.in_stream import InStream
 from sern_core.stream.out_channel import OutChannel
 from sern_core.stream.out_message import OutMessage
 from sern_core.vocabulary.errors import RefusedError, WireError
+from sern_core.vocabulary.key_news import ClientKeys, RelayKeys
 from sern_core.vocabulary.message import Message
 from sern_core.vocabulary.names import is_client_name, name_problem
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
@@ -51,9 +52,10 @@ from sern_core.wire.numbering import Numbering
 STREAMS_PER_US: Final = 10
 """Streams that are looked at in a microsecond."""
 LANE_US: Final = 300
+KEYS_US: Final = 100
 CONFIRMED_PER_US: Final = 8
-"""What a client is charged with, in microseconds: to open a datagram lane for it, and how many subscribers are asked
-for their share of a confirmation in one."""
+"""What a client is charged with, in microseconds: to open a datagram lane for it, to look at its keys, and how many
+subscribers are asked for their share of a confirmation in one."""
 MAX_SUBSCRIPTION_PARTS: Final = 64
 
 
@@ -275,6 +277,13 @@ class Hub:
         link.control.send(lane, now=now)
         link.open_lane(now=now)
 
+    def tell_keys(self, client: ClientName, keys: RelayKeys, *, now: float) -> None:
+        """Tell a client that asked in this session of the relay's keys."""
+        link = self.links[client]
+        said: framing.Envelope = {"t": "keys", "relay": list(keys.relay), "takes": keys.takes, "key": keys.key,
+                                  "code": keys.code, "why": keys.why[:400]}  # fmt: skip
+        link.control.send(said, now=now)
+
     def join(self, client: ClientName, data: bytes, *, now: float) -> bool:
         """A connection belongs to the session of the client: open the priority lane, unless it is open. `client`
         is bound to the connection's key. False: there is no such session. Raises WireError."""
@@ -406,6 +415,14 @@ class Hub:
                 self.clients.tell(
                     link.peer, {"t": "denied", "pattern": "", "code": refusal.code, "why": str(refusal)[:400]}, now
                 )
+        elif kind == "key":
+            link.reassembly.work_us += KEYS_US
+            told = ClientKeys(
+                relay=tuple(framing.take_strings(envelope, "relay", max_length=64)),
+                kept=framing.take_bool(envelope, "kept"),
+                key=framing.take_str(envelope, "key", max_length=64, default=""),
+            )
+            self.events.keys_told(link.peer, told)
         elif kind == "lane_ask":
             link.reassembly.work_us += LANE_US
             self.events.lane_asked(link.peer, framing.take_strings(envelope, "ciphers", max_length=64))
@@ -427,6 +444,8 @@ class Hub:
         self.matching.ask(client, self._subscriptions.pop(client), now=now)
         if framing.take_bool(envelope, "peers"):
             self.presence.watch(client, now=now)
+        if framing.take_bool(envelope, "keys"):
+            self.events.keys_asked(client)
 
     def _subscribed(self, client: ClientName, parts: list[str], now: float) -> None:
         self.absent.subscribed(client)

@@ -8,6 +8,7 @@ from sern_core.link.link import Link
 from sern_core.stream.in_stream import InStream
 from sern_core.stream.latched import MAX_REPLAY_MESSAGES, LatchedCache, ReplayStore
 from sern_core.stream.out_channel import OutChannel
+from sern_core.vocabulary.key_news import ClientKeys
 from sern_core.vocabulary.message import Message, StreamInfo
 from sern_core.vocabulary.types import ClientName
 
@@ -33,6 +34,12 @@ class HubEvents(Protocol):
 
     def lane_closed(self, client: ClientName) -> None:
         """The client's datagram lane ended with its session."""
+
+    def keys_asked(self, client: ClientName) -> None:
+        """A client would be told of the relay's keys: call `Hub.tell_keys`, or do nothing."""
+
+    def keys_told(self, client: ClientName, keys: ClientKeys) -> None:
+        """A client tells which of them it accepts, and which new one of its own it has."""
 
     def fault(self, client: ClientName | None, error: Exception) -> None:
         """Something raised what nobody expects, in the core or in one of these methods: log it with its traceback and
@@ -83,6 +90,12 @@ class GuardedEvents:
 
     def lane_closed(self, client: ClientName) -> None:
         self._tell(self.shell.lane_closed, client)
+
+    def keys_asked(self, client: ClientName) -> None:
+        self._tell(self.shell.keys_asked, client)
+
+    def keys_told(self, client: ClientName, keys: ClientKeys) -> None:
+        self._tell(self.shell.keys_told, client, keys)
 
 
 class Relayed:

@@ -25,6 +25,7 @@ from sern_core.stream.out_message import OutMessage, in_sequence
 from sern_core.summaries.spec import SummaryLevel
 from sern_core.vocabulary.codec_names import Compression
 from sern_core.vocabulary.errors import ConfigError, WireError
+from sern_core.vocabulary.key_news import ClientKeys, RelayKeys
 from sern_core.vocabulary.ledger import MAX_TOPICS, ReceiveLedger
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
@@ -55,6 +56,9 @@ class ClientEvents(Protocol):
 
     def lane_closed(self) -> None:
         """The datagram lane ended with its session: close its socket."""
+
+    def keys_told(self, keys: RelayKeys) -> None:
+        """The relay tells of its keys, and what became of the one that it was offered."""
 
     def stream_opened(self, stream: StreamInfo) -> None:
         """A stream from elsewhere, definition included. Raises ConfigError if this site cannot publish it."""
@@ -559,6 +563,15 @@ class ClientCore:
             self._tell(self.events.subscription_refused, code, why)
         elif kind == "peers":
             self.peers.told(envelope, now=now)
+        elif kind == "keys":
+            told = RelayKeys(
+                relay=tuple(framing.take_strings(envelope, "relay", max_length=64)),
+                takes=framing.take_bool(envelope, "takes"),
+                key=framing.take_str(envelope, "key", max_length=64, default=""),
+                code=framing.take_str(envelope, "code", max_length=64, default=""),
+                why=framing.take_str(envelope, "why", default=""),
+            )
+            self._tell(self.events.keys_told, told)
         elif kind == "objects_lost":
             if link.end.resumed:  # else all is told anyway
                 self.objects.lost()
@@ -567,6 +580,12 @@ class ClientCore:
             self._tell(self.events.object_refused, framing.take_str(envelope, "id", default=""), code, why)
         else:
             raise WireError(f"unknown control message {kind!r}")
+
+    def tell_keys(self, keys: ClientKeys, *, now: float) -> None:
+        """Tell the relay which of its keys this side accepts, and which other one of its own it has. Only to a relay
+        that told of its keys in this session."""
+        said: framing.Envelope = {"t": "key", "relay": list(keys.relay), "kept": keys.kept, "key": keys.key}
+        self.link.control.send(said, now=now)
 
     def ask_lane(self, ciphers: Sequence[str], *, now: float) -> None:
         """Ask the relay for a datagram session; `ClientEvents.lane_offered` has the answer, if it has one."""

@@ -31,4 +31,4 @@ class Subscription:
                 batch, batch_bytes = [], 0
             batch.append(pattern)
             batch_bytes += nbytes
-        self._control.send({"t": "subscribe", "patterns": batch, "more": False, "peers": True}, now=now)
+        self._control.send({"t": "subscribe", "patterns": batch, "more": False, "peers": True, "keys": True}, now=now)

@@ -3,9 +3,12 @@
 A public file holds one or more keys, each with an optional time window, so that an old and a new key overlap while a
 site changes over; several files may carry the same name. A secret file holds one pair, and is nobody else's to read.
 Keys are Z85 text (ZeroMQ RFC 32), 40 characters for 32 bytes. Wall time is handed in as `at_s`, Unix seconds.
+What was revoked stands in the folder `revoked` of the directory, and holds no more, wherever else it stands.
 Every problem is a ConfigError of one line that names the file and never shows a secret.
 """
 
+import base64
+import hashlib
 import os
 import re
 import stat
@@ -29,10 +32,15 @@ from sern_runtime.config.yaml import read_document
 
 PUBLIC_SUFFIX: Final = ".pub"
 SECRET_SUFFIX: Final = ".key"
+NEXT_SUFFIX: Final = ".next.key"
+"""Of the pair that is to take the place of NAME.key, beside it."""
+REVOKED_DIR: Final = "revoked"
 SECRET_MODE: Final = 0o600
 PUBLIC_MODE: Final = 0o644
 MAX_KEYS: Final = 16
 RAW_KEY_BYTES: Final = 32
+FINGERPRINT_GROUPS: Final = 5
+"""Groups of four characters of base32: 100 bits, which nobody finds another key for."""
 _Z85: Final = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
 _OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
 
@@ -68,6 +76,26 @@ def _unix_s(text: str) -> float:
 
 def _utc(at_s: float) -> str:
     return f"{datetime.fromtimestamp(at_s, UTC):%Y-%m-%dT%H:%M:%SZ}"
+
+
+def fingerprint(public_key: str) -> str:
+    """What people compare in place of a public key (Z85): the beginning of its SHA-256, in five groups of four."""
+    text = base64.b32encode(hashlib.sha256(z85.decode(public_key)).digest()).decode().lower()
+    return "-".join(text[start : start + 4] for start in range(0, 4 * FINGERPRINT_GROUPS, 4))
+
+
+def is_key(text: str) -> bool:
+    """Whether this is the Z85 text of a key."""
+    try:
+        _check_z85(text)
+    except ValueError:
+        return False
+    return True
+
+
+def utc(at_s: float) -> str:
+    """A time for people."""
+    return _utc(at_s)
 
 
 def clock_says(at_s: float) -> str:
@@ -189,6 +217,7 @@ class KeyStatus(StrEnum):
     UNKNOWN = "unknown"
     NOT_YET = "not_yet"
     EXPIRED = "expired"
+    REVOKED = "revoked"
 
 
 @dataclass(frozen=True, slots=True)
@@ -299,10 +328,10 @@ def write_secret(path: Path, key: SecretKey, *, replace: bool = False) -> None:
 
 
 def _write(path: Path, text: str, mode: int, *, replace: bool) -> None:
-    target = path.with_name(f".{path.name}.new") if replace else path
+    """Whatever happens meanwhile, the file is whole: as it was, or as it is to be."""
+    target = path.with_name(f".{path.name}.new")
     try:
-        if replace:
-            target.unlink(missing_ok=True)
+        target.unlink(missing_ok=True)  # of a run that was ended in the middle
         # O_EXCL: neither an existing file nor a link that someone placed there is followed.
         descriptor = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
         with os.fdopen(descriptor, "w", encoding="ascii") as stream:
@@ -311,10 +340,24 @@ def _write(path: Path, text: str, mode: int, *, replace: bool) -> None:
             os.fsync(stream.fileno())
         if replace:
             target.replace(path)
+        else:
+            path.hardlink_to(target)
+            target.unlink()
+        sync_directory(path.parent)
     except FileExistsError as error:
+        target.unlink(missing_ok=True)
         raise ConfigError("exists already; --force replaces it", file=str(path)) from error
     except OSError as error:
         raise ConfigError(f"can not be written: {error.strerror or error}", file=str(path)) from error
+
+
+def sync_directory(path: Path) -> None:
+    """Have what was renamed and removed in a folder outlive a loss of power. Raises OSError."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def user_id(name: ClientName, public_key: str) -> str:
@@ -334,28 +377,35 @@ class KeyDirectory:
     """The relay's clients: every `*.pub` file in one directory, read once. A reload makes a new one.
 
     Raises ConfigError for a missing directory, for a bad file (by its name), and for a key that stands in two places.
-    `warnings` names what lies there and is no public key file, or has the name of another client's.
+    `warnings` names what lies there and is no public key file, or has the name of another client's, or is revoked.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.warnings: tuple[str, ...] = ()
         self._by_key: dict[str, tuple[ClientName, PublicKey, str]] = {}
-        for file in self._files():
+        self._revoked: dict[str, tuple[ClientName, PublicKey]] = {}
+        revoked = path / REVOKED_DIR
+        if revoked.is_dir():
+            for file in self._files(revoked):
+                found = load_public(file)
+                self._revoked.update({key.key: (found.name, key) for key in found.keys})
+        for file in self._files(path):
             self._add(file)
 
-    def _files(self) -> list[Path]:
+    def _files(self, path: Path) -> list[Path]:
         try:
-            entries = sorted(self.path.iterdir())
+            entries = sorted(path.iterdir())
         except FileNotFoundError as error:
-            raise ConfigError("no such directory", file=str(self.path)) from error
+            raise ConfigError("no such directory", file=str(path)) from error
         except NotADirectoryError as error:
-            raise ConfigError("is not a directory", file=str(self.path)) from error
+            raise ConfigError("is not a directory", file=str(path)) from error
         except OSError as error:
-            raise ConfigError(f"can not be read: {error.strerror or error}", file=str(self.path)) from error
-        others = [e for e in entries if e.suffix != PUBLIC_SUFFIX and not e.name.startswith(".")]
-        self.warnings = tuple(f"{e}: is not read, its name does not end in {PUBLIC_SUFFIX}" for e in others)
-        return [e for e in entries if e.suffix == PUBLIC_SUFFIX and not e.name.startswith(".")]
+            raise ConfigError(f"can not be read: {error.strerror or error}", file=str(path)) from error
+        shown = [e for e in entries if not e.name.startswith(".")]
+        others = [e for e in shown if e.suffix != PUBLIC_SUFFIX and e.name != REVOKED_DIR]
+        self.warnings += tuple(f"{e}: is not read, its name does not end in {PUBLIC_SUFFIX}" for e in others)
+        return [e for e in shown if e.suffix == PUBLIC_SUFFIX]
 
     def _add(self, file: Path) -> None:
         keys = load_public(file)
@@ -363,6 +413,10 @@ class KeyDirectory:
         if odd is not None:
             self.warnings = (*self.warnings, odd)
         for key in keys.keys:
+            if key.key in self._revoked:
+                problem = f"{file}: the key {fingerprint(key.key)} of {keys.name} is revoked, and lets nobody in"
+                self.warnings = (*self.warnings, problem)
+                continue
             known = self._by_key.get(key.key)
             if known is not None:
                 problem = f"this key of {keys.name} stands also in {known[2]} as one of {known[0]}; remove one"
@@ -377,6 +431,15 @@ class KeyDirectory:
     def keys_of(self, name: ClientName) -> tuple[PublicKey, ...]:
         return tuple(key for owner, key, _ in self._by_key.values() if owner == name)
 
+    def file_of(self, public_key: str) -> Path | None:
+        """The file in which a key stands that is not revoked."""
+        found = self._by_key.get(public_key)
+        return None if found is None else self.path / found[2]
+
+    def revoked(self) -> tuple[tuple[ClientName, PublicKey], ...]:
+        """The keys that were revoked, and whose they were; each ends when it was revoked, if not before."""
+        return tuple(self._revoked.values())
+
     def lapsed(self, *, at_s: float) -> tuple[str, ...]:
         """A phrase for each client of which no key holds at `at_s`."""
         found = ((name, PublicKeys(name, self.keys_of(name)).lapse(at_s)) for name in self.names)
@@ -384,9 +447,11 @@ class KeyDirectory:
 
     def lookup(self, public_key: str | bytes, *, at_s: float) -> KeyMatch:
         """Whose key this is and whether it holds now. `public_key` is Z85 text, or 32 raw bytes as ZAP hands over."""
-        found = self._by_key.get(_as_z85(public_key))
+        text = _as_z85(public_key)
+        found = self._by_key.get(text)
         if found is None:
-            return KeyMatch(KeyStatus.UNKNOWN)
+            revoked = self._revoked.get(text)
+            return KeyMatch(KeyStatus.UNKNOWN) if revoked is None else KeyMatch(KeyStatus.REVOKED, *revoked)
         return KeyMatch(found[1].status(at_s), found[0], found[1])
 
 

@@ -75,8 +75,18 @@ class RelaySection(Section):
     """No keys and no encryption, clients are who they say they are; only for ipc and loopback."""
     max_connections: Count = 256
     """Connections at a time, beyond which new ones are refused."""
+    rotate_keys: bool = False
+    """Take a further key of a client's own that it asks for inside its session (`sern keys rotate`), and write it to
+    its file in `clients_dir`, which this process must be allowed to do."""
+    key_overlap_s: Annotated[float, Field(ge=1, le=1e8)] = 86_400.0
+    """How long the key with which a client asked for a further one still holds."""
     handshake_interval_s: Annotated[float, Field(ge=1, le=120)] = 10.0
     """Time for a connection to prove its key. It takes 4 round trips: below 5 s satellite links are locked out."""
+
+    @property
+    def overlap_s(self) -> float | None:
+        """How long an old key overlaps with a new one; None: clients bring none."""
+        return self.key_overlap_s if self.rotate_keys else None
 
     @model_validator(mode="after")
     def _keys(self) -> "RelaySection":

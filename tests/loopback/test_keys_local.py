@@ -6,7 +6,7 @@ import pytest
 import zmq
 
 from sern_core.vocabulary.types import ClientName
-from sern_runtime.config.keys import PublicKey, PublicKeys, load_public, load_secret, write_public
+from sern_runtime.config.keys import PublicKey, PublicKeys, generate, load_public, load_secret, write_public
 from sern_runtime.monitor import ConnectionTable
 from tests.daemons import Lab
 from tests.loopback.test_security import DEAD_ENDS, Stranger, hello
@@ -44,7 +44,8 @@ async def test_a_replaced_key_is_cut_off_over_ipc_and_comes_back_when_it_is_put_
         robot = await lab.connected(lab.client_file("robot1", DEAD_ENDS))
         public = lab.clients_dir / "robot1.pub"
         old = public.read_text()
-        lab.make_keys("robot1")  # the new pair is at the relay; the client runs with the old one
+        another = PublicKey(generate(ClientName("robot1")).public_key)
+        write_public(public, PublicKeys(ClientName("robot1"), (another,)), replace=True)
         relay.reload()
         assert list(relay.server.clients.sessions()) == []
         await until(lambda: "refused our key" in robot.news.reason)

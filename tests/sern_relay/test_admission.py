@@ -46,17 +46,19 @@ def test_what_a_new_directory_takes_away_is_told_once(tmp_path: Path) -> None:
     public(tmp_path / "before", old)
     public(tmp_path / "before", generate(OTHER))
     admission = Admission(read_directory(tmp_path / "before"))
-    assert admission.take_lapsed() == []
+    assert admission.take_lapsed() == {}
     public(tmp_path / "after", new)
     admission.replace(read_directory(tmp_path / "after"))
-    assert admission.take_lapsed() == [ROBOT, OTHER]
-    assert admission.take_lapsed() == []
+    lapsed = admission.take_lapsed()
+    assert list(lapsed) == [ROBOT, OTHER] and lapsed[ROBOT] == {old.public_key}
+    assert admission.take_lapsed() == {}
+    assert admission.valid()[ROBOT] == {new.public_key}
     assert not admission.known(OTHER)
 
 
 def test_without_a_directory_everybody_may_come(tmp_path: Path) -> None:
     admission = Admission(read_directory(None))
     assert admission.known(ROBOT) and admission.status(ROBOT, "any") is KeyStatus.VALID
-    assert admission.take_lapsed() == []
+    assert admission.take_lapsed() == {}
     with pytest.raises(ConfigError, match="nowhere"):
         read_directory(tmp_path / "nowhere")

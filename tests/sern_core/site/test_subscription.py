@@ -39,9 +39,9 @@ def subscribed(patterns: tuple[str, ...], known: tuple[str, ...] = ()) -> list[d
 
 def test_few_patterns_go_in_one_envelope_that_is_the_last() -> None:
     assert subscribed(("/a/.*", "/b/.*")) == [
-        {"t": "subscribe", "patterns": ["/a/.*", "/b/.*"], "more": False, "peers": True}
+        {"t": "subscribe", "patterns": ["/a/.*", "/b/.*"], "more": False, "peers": True, "keys": True}
     ]
-    assert subscribed(()) == [{"t": "subscribe", "patterns": [], "more": False, "peers": True}]
+    assert subscribed(()) == [{"t": "subscribe", "patterns": [], "more": False, "peers": True, "keys": True}]
 
 
 def test_many_and_long_ones_go_in_several_whole_and_in_order() -> None:
