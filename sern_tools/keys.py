@@ -49,6 +49,8 @@ RELAY_FILE: Final = Path("/etc/sern/relay.yaml")
 CLIENT_FILE: Final = Path("/etc/sern/client.yaml")
 IN_FORCE_S: Final = 10.0
 """How long a daemon may take to do what it was told; it takes less than a second."""
+TOLD_S: Final = 5.0
+"""How long clients that are connected may take to say that they have a key for good."""
 POLL_S: Final = 0.1
 ROUTE: Final = "/api/keys"
 
@@ -285,11 +287,10 @@ def rotate_relay(loaded: Loaded[RelayFile], *, switch: bool, force: bool, out: C
     mark = fingerprint(pair.public_key)
     relay.reload()
     view = relay.wait(lambda view: mark in (view["relay"]["next"], view["relay"]["in_use"]), "the key to come")
-    if not switch:
-        until_s = time.monotonic() + IN_FORCE_S
-        while _missing(view, mark, connected=True) and time.monotonic() < until_s:
-            time.sleep(POLL_S)
-            view = relay.view()
+    until_s = time.monotonic() + TOLD_S
+    while _missing(view, mark, connected=True) and time.monotonic() < until_s:
+        time.sleep(POLL_S)
+        view = relay.view()
     missing = _missing(view, mark)
     for line in missing.values():
         out(line)
@@ -318,7 +319,7 @@ def _missing(view: dict[str, Any], mark: str, *, connected: bool = False) -> dic
             found[name] = f"{name} does not know it: " + (
                 "it is connected" if seen["connected"] else "it is not connected"
             )
-        elif not seen["kept"] and not connected:
+        elif not seen["kept"]:
             found[name] = f"{name} knows it until it is started again: it may not write its relay's key file"
     return found
 

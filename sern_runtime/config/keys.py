@@ -11,7 +11,9 @@ import base64
 import hashlib
 import os
 import re
+import secrets
 import stat
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -329,9 +331,9 @@ def write_secret(path: Path, key: SecretKey, *, replace: bool = False) -> None:
 
 def _write(path: Path, text: str, mode: int, *, replace: bool) -> None:
     """Whatever happens meanwhile, the file is whole: as it was, or as it is to be."""
-    target = path.with_name(f".{path.name}.new")
+    # A name of its own: two clients of one machine may write the relay's file at the same time.
+    target = path.with_name(f".{path.name}.{secrets.token_hex(8)}.new")
     try:
-        target.unlink(missing_ok=True)  # of a run that was ended in the middle
         # O_EXCL: neither an existing file nor a link that someone placed there is followed.
         descriptor = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
         with os.fdopen(descriptor, "w", encoding="ascii") as stream:
@@ -345,10 +347,12 @@ def _write(path: Path, text: str, mode: int, *, replace: bool) -> None:
             target.unlink()
         sync_directory(path.parent)
     except FileExistsError as error:
-        target.unlink(missing_ok=True)
         raise ConfigError("exists already; --force replaces it", file=str(path)) from error
     except OSError as error:
         raise ConfigError(f"can not be written: {error.strerror or error}", file=str(path)) from error
+    finally:
+        with suppress(OSError):  # of a folder that cannot be written, where it is not
+            target.unlink(missing_ok=True)
 
 
 def sync_directory(path: Path) -> None:
