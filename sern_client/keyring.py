@@ -66,6 +66,8 @@ class ClientKeyring:
         self.server_keys: tuple[str, ...] = ()
         self.problem = ""
         """Why the pair to come is not taken by the relay; empty: it was not refused."""
+        self.reloads = 0
+        """How often it was told to read them again."""
         self._use = use
         self._tell = tell
         self._at_s = at_s
@@ -99,6 +101,8 @@ class ClientKeyring:
     def reload(self) -> None:
         """Read the files again, and have in force what is new in them. A bad one leaves everything as it was."""
         before, server_before = self.keys, self.server_keys
+        self.reloads += 1
+        self.problem = ""  # what was refused before is offered again
         try:
             self.read()
         except ConfigError as error:
@@ -220,6 +224,7 @@ class ClientKeyring:
             "in_use": fingerprint(self.keys.public_key),
             "other": None if other is None else fingerprint(other.public_key),
             "problem": self.problem,
+            "reloads": self.reloads,
             "told": self._told is not None,
             "takes": self._told is not None and self._told.takes,
             "relay": [fingerprint(key) for key in self.server_keys],

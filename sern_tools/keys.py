@@ -264,12 +264,16 @@ def rotate_client(loaded: Loaded[ClientFile], *, out: Callable[[str], None], lim
     client = _running_client(loaded)
     again = f"the new pair waits in {secret.with_suffix(NEXT_SUFFIX)}: give the command again to go on"
     try:
-        client.reload()
-        view = client.wait(lambda view: view["in_use"] == mark or bool(view["problem"]), "the new key", limit_s=limit_s)
+        before = client.reload()["reloads"]
+
+        def answered(view: dict[str, Any]) -> bool:
+            return view["in_use"] == mark or (view["reloads"] != before and bool(view["problem"]))
+
+        view = client.wait(answered, "the new key", limit_s=limit_s)
     except SernError as error:
         raise SernError(f"{error}; {again}") from error
     if view["in_use"] != mark:
-        add = f"sern keys add {pair.name} '{pair.public_key}'"
+        add = f"sern keys add {pair.name} -- '{pair.public_key}'"  # it may begin with a hyphen
         raise SernError(f"{view['problem']}. On the relay: {add}. Here {again}")
     put_in_place(secret, pair)
     client.reload()
@@ -371,7 +375,7 @@ def revoke_command(name: Annotated[str, typer.Argument(help="The client.")], con
 @app.command("add")
 def add_command(
     name: Annotated[str, typer.Argument(help="The client.")],
-    key: Annotated[str, typer.Argument(help="Its further public key, 40 characters, in single quotes.")],
+    key: Annotated[str, typer.Argument(help="Its further public key: -- 'KEY', as it may begin with a hyphen.")],
     config: _Relay = RELAY_FILE,
 ) -> None:
     """Let a client have a further public key; the one that it has ends after relay.key_overlap_s. On the relay."""

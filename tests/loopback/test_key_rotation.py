@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Callable
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,11 @@ from sern_runtime.config.keys import (
     PublicKey,
     PublicKeys,
     fingerprint,
+    generate,
     load_public,
     load_secret,
     write_public,
+    write_secret,
 )
 from sern_runtime.config.relay import load_relay
 from sern_tools import keys
@@ -182,14 +185,14 @@ async def test_a_relay_that_takes_no_keys_over_the_link_says_what_its_operator_d
     async with Lab(tmp_path, "robot1") as lab:
         relay = await lab.process(lab.relay_file()).ready()
         robot = await lab.process(lab.client_file("robot1", DEAD_ENDS)).ready()
+        coming = next(pair for pair in map(generate, repeat(ROBOT)) if pair.public_key.startswith("-"))
+        write_secret(tmp_path / "robot1.next.key", coming)
         said: list[str] = []
-        with pytest.raises(SernError, match=r"takes no keys over the link .* On the relay: sern keys add robot1 '"):
+        with pytest.raises(SernError, match=r"takes no keys over the link .* On the relay: sern keys add robot1 -- '"):
             await asyncio.to_thread(keys.rotate_client, load_client(robot.config), out=said.append)
         assert len(load_public(lab.clients_dir / "robot1.pub").keys) == 1
-        coming = load_secret(tmp_path / "robot1.next.key")
-        code = await asyncio.to_thread(
-            run_sern, "keys", "add", "robot1", coming.public_key, "--config", str(relay.config)
-        )  # fmt: skip
+        words = ("keys", "add", "robot1", "--config", str(relay.config), "--", coming.public_key)
+        code = await asyncio.to_thread(run_sern, *words)
         assert code == 0
         await asyncio.to_thread(keys.rotate_client, load_client(robot.config), out=said.append)
         assert load_secret(tmp_path / "robot1.key") == coming
