@@ -9,10 +9,11 @@ import logging
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from functools import partial
+from math import inf
 from typing import Final
 
 from sern_client.endpoints.base import TopicNews, ViewingEndpoint
-from sern_client.site import Site
+from sern_client.site import CAPPED, Site
 from sern_core.objects.xr_object import XrObject
 from sern_core.site.services import parse as parse_service
 from sern_core.topics.patterns import PatternSet
@@ -49,6 +50,7 @@ class OnDemand:
         self._viewers = viewers
         self._add = add
         self._ledger = ledger
+        self._capped_hz: dict[TopicName, float | None] = {}  # of them, by global name
         self._offered: dict[str, tuple[TopicName, TopicInfo]] = {}  # by the object: global name, and what it is here
         self._wants: dict[TopicName, set[int]] = {}  # local names, by the viewers that want them
         self._told: list[TopicName] = []
@@ -79,6 +81,7 @@ class OnDemand:
             self.deleted(item.id)
         if info is not None:
             self._offered[item.id] = name, info
+            self._capped_hz[name] = _rate(item.attributes.get(CAPPED, ""))
             self._each(lambda viewer: viewer.topic_offered(info))
             if info.name in self._wants:
                 self._soon()
@@ -86,6 +89,7 @@ class OnDemand:
     def deleted(self, object_id: str) -> None:
         offered = self._offered.pop(object_id, None)
         if offered is not None:
+            self._capped_hz.pop(offered[0], None)
             name = offered[1].name
             self._each(lambda viewer: viewer.topic_withdrawn(name))
             self._soon()
@@ -133,7 +137,12 @@ class OnDemand:
         now = clock.now()
         rules, namespace = self._site.rules, self._site.namespace
         return [
-            TopicNews(rules.inward(name, namespace=namespace), counters.age_of_information_s(now), counters.by_reason)
+            TopicNews(
+                rules.inward(name, namespace=namespace),
+                counters.age_of_information_s(now),
+                counters.by_reason,
+                self._capped_hz.get(name),
+            )
             for name, counters in self._ledger.topics.items()
             if name != OTHER_TOPIC
         ]
@@ -152,6 +161,15 @@ class OnDemand:
         if wanted != self._told:
             self._told = wanted
             self._add(wanted)
+
+
+def _rate(text: str) -> float | None:
+    """A rate as an origin says it; None: it says none, or what is none."""
+    try:
+        rate_hz = float(text)
+    except ValueError:
+        return None
+    return rate_hz if 0.0 < rate_hz < inf else None
 
 
 class _Viewer:

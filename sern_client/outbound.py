@@ -11,7 +11,7 @@ from sern_client.durable import DurableTopics
 from sern_client.endpoints.base import Difference, Sink, Subscription
 from sern_client.frames import Rewrite
 from sern_client.leaving import Leaving
-from sern_client.site import Site
+from sern_client.site import CAPPED, Site
 from sern_client.stored_topics import StoredTopics
 from sern_client.summaries.client_summaries import Summaries
 from sern_client.summaries.source import Source, streams_of
@@ -223,7 +223,8 @@ class Outbound:
             spec = replace(spec, max_rate_hz=None, depth=1 if static else spec.depth)
         if self._durable is not None and spec.durable:
             return self._durable.publish(replace(info, name=name), spec), None
-        channel = core.publish(replace(info, name=name), spec, now=clock.now())
+        capped = {} if spec.reliable or spec.max_rate_hz is None else {CAPPED: f"{spec.max_rate_hz:g}"}
+        channel = core.publish(replace(info, name=name), spec, now=clock.now(), attributes=capped)
         if not merge:
             return channel, None
         send = self._sender(channel, info)

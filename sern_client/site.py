@@ -1,6 +1,7 @@
 """What both directions between an endpoint and the core share: the endpoint, and how things there are called."""
 
 from collections.abc import Callable
+from typing import Final
 
 from sern_client.endpoints.base import Endpoint, Publisher
 from sern_client.endpoints.conversion import Converter, HasConverter
@@ -11,6 +12,9 @@ from sern_core.vocabulary.message import TopicInfo
 from sern_runtime.events import EventLog
 from sern_runtime.message_log import MessageLog
 from sern_runtime.optional import OptionalParts
+
+CAPPED: Final = "max_rate_hz"
+"""The attribute of a stream that its origin thins to a rate, as text: with it whoever looks at the topic is told."""
 
 
 class Site:

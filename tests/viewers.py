@@ -48,8 +48,8 @@ class FakeViewed:
         self.asked += 1
         return list(self.news.values())
 
-    def set(self, name: str, age_s: float | None, **dropped: int) -> None:
-        self.news[name] = TopicNews(TopicName(name), age_s, dict(dropped))  # type: ignore[arg-type]
+    def set(self, name: str, age_s: float | None, *, capped_hz: float | None = None, **dropped: int) -> None:
+        self.news[name] = TopicNews(TopicName(name), age_s, dict(dropped), capped_hz)  # type: ignore[arg-type]
 
 
 class Shown(NamedTuple):

@@ -292,11 +292,12 @@ class ShowingEndpoint(Protocol):
 class TopicNews(NamedTuple):
     """How a topic of another site fares here, by its local name. `age_s`: how old its newest message is now, since its
     origin took it and without comparing clocks; None: none has come. `dropped`: its messages that did not come, by
-    reason, since the client started."""
+    reason, since the client started. `capped_hz`: its origin thins it to this rate; None: it does not."""
 
     name: TopicName
     age_s: float | None
     dropped: Mapping[DropReason, int]
+    capped_hz: float | None = None
 
 
 class Viewed(Protocol):

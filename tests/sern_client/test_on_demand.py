@@ -15,7 +15,7 @@ from sern_core.objects.xr_object import XrObject
 from sern_core.topics.patterns import PatternSet, compile_pattern
 from sern_core.topics.rules import Direction, RuleSet, TopicRule
 from sern_core.vocabulary.ledger import ReceiveLedger
-from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.vocabulary.types import ClientName, Encoding, ObjectKind, TopicName
 from tests.bridges import FakeEndpoint
 from tests.support import until
@@ -52,10 +52,9 @@ class Case:
         rules = RuleSet((TopicRule(compile_pattern("/secret"), direction=Direction.SEND),))
         self.viewers = [Viewer(), Viewer()]
         self.told: list[list[TopicName]] = []
+        self.ledger = ReceiveLedger()
         site = Site(FakeEndpoint(), rules, "/van", kick=lambda: None)
-        self.made = OnDemand(
-            PatternSet(["/robot.*", "/van/.*"]), site, self.viewers, add=self._add, ledger=ReceiveLedger()
-        )
+        self.made = OnDemand(PatternSet(["/robot.*", "/van/.*"]), site, self.viewers, add=self._add, ledger=self.ledger)
 
     def _add(self, names: Iterable[TopicName]) -> None:
         self.told.append(list(names))
@@ -145,6 +144,21 @@ async def test_what_nobody_understands_is_not_offered_and_said(case: Case, caplo
     case.made.changed(replace(thing("/robot/x"), attributes={}))
     assert not case.viewers[0].offered
     assert "/robot/odom of robot is not offered to viewers: 'morse' is not a valid Encoding" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("said", "capped_hz"), [("2.5", 2.5), ("fast", None), ("-1", None), ("inf", None), ("nan", None)]
+)
+async def test_how_often_a_topic_comes_at_most_is_what_its_origin_says(
+    case: Case, said: str, capped_hz: float | None
+) -> None:
+    topic = TopicName("/robot/odom")
+    stream = StreamInfo(StreamId(ClientName("robot"), 1, topic), TopicInfo(topic, "a/B", Encoding.CDR), TopicSpec())
+    case.ledger.of(stream).arrived(10, 0.1, 1.0)
+    case.there("/robot/odom", max_rate_hz=said)
+    assert [news.capped_hz for news in case.made.topics()] == [capped_hz]
+    case.made.deleted(thing("/robot/odom").id)
+    assert [news.capped_hz for news in case.made.topics()] == [None]
 
 
 async def test_a_viewer_that_fails_costs_the_others_nothing(case: Case) -> None:

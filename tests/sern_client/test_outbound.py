@@ -52,6 +52,18 @@ class Robot:
         return self.endpoint.open[name].sink(body, 1)
 
 
+async def test_a_topic_that_is_thinned_says_so_of_itself() -> None:
+    rules = [
+        TopicRule(compile_pattern("/pose"), max_rate_hz=2.5),
+        TopicRule(compile_pattern("/log"), max_rate_hz=2.5, reliability=Reliability.RELIABLE),
+    ]
+    robot = Robot(*rules)
+    for name in ("/pose", "/log", "/other"):
+        robot.outbound.topic_added(topic(name))
+    said = {name: channel.stream.attributes for name, channel in robot.channels.items()}
+    assert said == {"/robot/pose": {"max_rate_hz": "2.5"}, "/robot/log": {}, "/robot/other": {}}
+
+
 async def test_a_topic_is_offered_under_its_global_name_and_its_messages_go_there() -> None:
     robot = Robot()
     robot.outbound.topic_added(topic(POSE))

@@ -21,9 +21,10 @@ TELL_S: Final = 5.0
 CALM_S: Final = 30.0
 """A status that has not changed for so long is taken back."""
 MAX_STATUSES: Final = 500
-WARNING, ERROR = 1, 2
+INFO, WARNING, ERROR = 0, 1, 2
 """Levels of a status (Foxglove WebSocket protocol)."""
 _DROPPED: Final = "sern/dropped"
+_CAPPED: Final = "sern/capped"
 _LEFT_OUT: Final = "sern/left_out"
 
 
@@ -127,7 +128,7 @@ class News:
         if not self._viewers():
             self._of_viewers.clear()
             self._of_link = Episodes()
-            self.take_back([status for status in self._active if status.startswith(_DROPPED)])
+            self.take_back([status for status in self._active if status.startswith((_DROPPED, _CAPPED))])
             return
         now = clock.now()
         self._timer.arm(now + LOOK_S)
@@ -143,7 +144,13 @@ class News:
             del self._of_viewers[viewer]
 
     def _look_at_link(self, now: float) -> None:
-        topics = {news.name: _lost(news.dropped) for news in self._topics()}
+        all_news = self._topics()
+        capped = {f"{_CAPPED}{news.name}": news for news in all_news if news.capped_hz and news.age_s is not None}
+        for status, news in capped.items():
+            text = f"{news.name} comes {news.capped_hz:g} times a second at most: its site thins it (max_rate_hz there)"
+            self.say(status, text, INFO)
+        self.take_back([status for status in self._active if status.startswith(_CAPPED) and status not in capped])
+        topics = {news.name: _lost(news.dropped) for news in all_news}
         for name, dropped in topics.items():
             told = self._of_link.update(name, sum(dropped.values()), now=now)
             if told is not None:

@@ -126,6 +126,22 @@ async def test_what_did_not_come_is_told_with_its_reasons(monkeypatch: pytest.Mo
             await until(lambda: not late.statuses and not person.statuses, "it is taken back")
 
 
+async def test_a_topic_that_its_site_thins_says_so_while_it_comes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(news, "LOOK_S", 0.01)
+    async with bridge() as run, viewer(run.port) as person:
+        run.viewed.set("/odom", None, capped_hz=2.5)
+        asked = run.viewed.asked
+        await until(lambda: run.viewed.asked > asked + 3)
+        assert person.statuses == {}, "nobody looks at it"
+        run.viewed.set("/odom", 0.1, capped_hz=2.5)
+        await until(lambda: person.statuses)
+        assert person.statuses == {
+            "sern/capped/odom": "/odom comes 2.5 times a second at most: its site thins it (max_rate_hz there)"
+        }
+        run.viewed.set("/odom", 0.1)
+        await until(lambda: not person.statuses, "it is thinned no more")
+
+
 async def test_a_status_is_taken_back_when_it_is_calm(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(news, "LOOK_S", 0.01)
     monkeypatch.setattr(news, "CALM_S", 0.05)
