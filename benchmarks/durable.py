@@ -78,7 +78,7 @@ def _count(http: str, name: str) -> float:
 
 
 async def _rate(read: Callable[[], float], seconds: float, children: Children) -> float:
-    """By how much a count grows in a second, once it grows at all."""
+    """The growth of a count in a second, once it grows at all."""
 
     async def begun() -> bool:
         return await asyncio.to_thread(read) > 0
@@ -176,7 +176,7 @@ async def _store(folder: Path, seconds: float) -> float:
 
 
 class _Nats:
-    """As much of the protocol of NATS as a publisher of JetStream needs."""
+    """The part of NATS's protocol that a publisher of JetStream needs."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._reader = reader

@@ -52,7 +52,7 @@ def _register_link(metrics: Metrics, parts: Counting) -> None:
     register_received(metrics, core.received, bridge.inbound.ages)
     register_codecs(metrics, core.coder)
     parts.link_state.register(metrics)
-    register_durable(metrics, bridge.durable)
+    register_durable(metrics, None if bridge.durable is None else bridge.durable.disk)
     parts.errors.register(metrics)
     parts.collector.register(metrics)
     register_summaries(metrics, bridge.outbound.summaries)

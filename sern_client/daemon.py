@@ -58,8 +58,7 @@ from sern_runtime.codec_pool import CodecPool, make_coder
 from sern_runtime.collector import CollectorWatch
 from sern_runtime.config.client import ClientFile, ServicesSection, load_client
 from sern_runtime.config.load import Loaded
-from sern_runtime.durable.keeper import Keeper, Stored
-from sern_runtime.durable.store import Store
+from sern_runtime.durable.disk import Disk
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.events import EventLog
 from sern_runtime.http_routes import Health
@@ -201,14 +200,8 @@ class ClientDaemon:
         section = self.loaded.model.durable
         if section is None:
             return None
-        directory, most = self.loaded.resolve(section.directory), section.max_bytes
-        store = Store(directory)
-
-        def keeper(stored: Stored) -> Keeper:
-            call_soon = asyncio.get_running_loop().call_soon_threadsafe
-            return Keeper(store, call_soon=call_soon, stored=stored, max_bytes=most)
-
-        return lambda core: DurableTopics(store, keeper, core=core, now=clock.now)
+        disk = Disk.within(self.loaded.resolve(section.directory), max_bytes=section.max_bytes)
+        return lambda core: DurableTopics(disk, core=core, now=clock.now)
 
     def _rule_of(self, info: TopicInfo) -> TopicSpec:
         """How a topic of this site is treated, by its global name."""

@@ -6,7 +6,6 @@ one is ended. What earlier processes have left is offered at once, whether its p
 """
 
 import logging
-import secrets
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -15,11 +14,13 @@ from typing import Any, NamedTuple
 from sern_core.site.client import ClientCore, KeptMessage, KeptPlace
 from sern_core.stream.out_channel import OutChannel
 from sern_core.stream.prices import MESSAGE_OVERHEAD_BYTES
-from sern_core.vocabulary.errors import UsageError, WireError
+from sern_core.vocabulary.errors import ConfigError, UsageError, WireError
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.vocabulary.types import TopicName
 from sern_core.wire.announce import Announcement, decode_announcement, definition_hash, encode_announcement
-from sern_runtime.durable.keeper import Keeps, OpensStore, Stored
-from sern_runtime.durable.store import Contents, Described, Forget, KeptStream, Put, Row, StoreError
+from sern_runtime.durable.disk import Disk
+from sern_runtime.durable.keeper import Keeps
+from sern_runtime.durable.store import Described, KeptStream, Put, Row
 
 Send = Callable[[bytes, int, float | None], bool]
 StoredCount = Callable[[int], None]
@@ -65,90 +66,66 @@ class _Topic:
 
 
 class DurableTopics:
-    """The durable topics of one client. `make_keeper` makes what writes to the store. `now` is the clock of the core,
-    `wall_ns` the one that goes on while the machine is off."""
+    """The durable topics of one client. `now` is the clock of the core, `wall_ns` the one that goes on while the
+    machine is off."""
 
     def __init__(
-        self,
-        store: OpensStore,
-        make_keeper: Callable[[Stored], Keeps],
-        *,
-        core: ClientCore,
-        now: Callable[[], float],
-        wall_ns: Callable[[], int] = time.time_ns,
+        self, disk: Disk, *, core: ClientCore, now: Callable[[], float], wall_ns: Callable[[], int] = time.time_ns
     ) -> None:
-        self._store = store
-        self._make_keeper = make_keeper
+        self.disk = disk
         self._core = core
         self._now = now
         self._wall_ns = wall_ns
         self._topics: dict[StreamId, _Topic] = {}
-        self._keeper: Keeps | None = None
         self._found: dict[StreamId, KeptStream] = {}
         self._boot = 0
         self._closed = False
-        self.damaged = 0
-        """Messages, and other things, that could not be read when the store was opened."""
-        self._problem: str | None = None
-
-    def _took(self, contents: Contents) -> None:
-        self._boot = contents.boot
-        self._found = contents.streams
-        self.damaged = len(contents.damage)
-        for line in contents.damage:
-            _log.error("durable topics: %s", line)
 
     @property
-    def problem(self) -> str | None:
-        """Why nothing is kept at the moment; None: it is."""
-        return self._problem or (None if self._keeper is None else self._keeper.problem)
-
-    @property
-    def keeper(self) -> Keeps | None:
-        """What writes; None: nothing is kept by this process."""
-        return self._keeper
+    def _keeper(self) -> Keeps:
+        """What writes. There are durable topics only where there is one."""
+        assert self.disk.keeper is not None
+        return self.disk.keeper
 
     def start(self, rule: Callable[[TopicInfo], TopicSpec]) -> None:
         """Begin to write, and offer what earlier processes have left. `rule` says how a global topic is treated now.
-
-        Raises ConfigError for a directory that cannot be used. Where the disk is full or fails, `problem` says so, and
-        durable topics are for this process what reliable ones are.
-        """
-        try:
-            contents = self._store.open(new_boot=secrets.randbits(63))
-        except StoreError as error:
-            self._problem = str(error)
-            _log.error("durable topics are not kept by this process: %s; make room and start it again", error)
+        Raises ConfigError as `Disk.open` does."""
+        contents = self.disk.open(self._stored)
+        if contents is None:
             return
-        self._took(contents)
-        self._keeper = self._make_keeper(self._stored)
-        for stream, found in self._found.items():
-            for row in found.rows:
-                self._keeper.found(stream, row.seq, len(row.body))
-        self._keeper.start()
+        self._boot, self._found = contents.boot, contents.streams
         for found in [found for found in self._found.values() if found.rows]:
             try:
                 info, spec = _described(found)
-                now = rule(info)
-                if _said(found.id, info, now) == found.announcement:
-                    spec = now  # with what is not said on the wire
-                self.publish(info, spec)
+                self.publish(info, self._rule(found, info, spec, rule))
             except (UsageError, WireError) as error:
                 _log.error("%d messages of %s are lost: %s", len(found.rows), found.id.topic, error)
-                self._forget(found.id)
+                self._found.pop(found.id, None)
+                self._keeper.forget(found.id)
+
+    def _rule(
+        self, found: KeptStream, info: TopicInfo, then: TopicSpec, rule: Callable[[TopicInfo], TopicSpec]
+    ) -> TopicSpec:
+        """How to treat what was found: as now, where that says the same on the wire, else as `then`."""
+        try:
+            now = rule(info)
+        except ConfigError:
+            return then
+        return now if _said(found.id, info, now) == found.announcement else then
 
     # --- topics come and go -----------------------------------------------------------------------------------------
 
     def publish(self, info: TopicInfo, spec: TopicSpec) -> OutChannel:
         """Offer a durable topic under its global name, or go on with it. Raises UsageError."""
-        keeper = self._keeper
-        if keeper is None:
+        if self.disk.keeper is None:
             return self._core.publish(info, spec, now=self._now())
         identity = StreamId(self._core.name, self._boot, info.name)
         said = _said(identity, info, spec)
         known = self._topics.get(identity)
         if known is not None:
-            if known.leaving and _said(identity, known.channel.stream.info, known.channel.spec) == said:
+            if not known.leaving:
+                raise UsageError(f"{info.name} is offered already")
+            if _said(identity, known.channel.stream.info, known.channel.spec) == said:
                 self._core.set_compression(known.channel, spec.compression, now=self._now())
                 return known.channel
             self._end(known)
@@ -157,7 +134,7 @@ class DurableTopics:
         if found is not None and found.announcement != said:
             if rows:
                 _log.error("%d messages of %s are dropped: it is another topic now", len(rows), info.name)
-                keeper.trim(identity, last)
+                self._keeper.trim(identity, last)
             rows, required = [], ()
         first = rows[0].seq if rows else last + 1
         channel = self._core.publish(info, spec, now=self._now(), required=required, kept=KeptPlace(self._boot, first))
@@ -178,7 +155,6 @@ class DurableTopics:
             return send
         topic.send, topic.stored, topic.leaving = send, stored, False
         keeper = self._keeper
-        assert keeper is not None
 
         def keep(body: bytes, stamp_ns: int, born_s: float | None) -> bool:
             size = len(body)
@@ -204,11 +180,17 @@ class DurableTopics:
         topic.stored, topic.leaving = None, True
         return True
 
+    def give_way(self, name: TopicName) -> None:
+        """This global topic is not durable any more: what is left of it ends."""
+        topic = self._topics.get(StreamId(self._core.name, self._boot, name))
+        if topic is not None:
+            self._end(topic)
+
     def look(self) -> None:
         """Let go of what is delivered. Call about twice a second."""
-        keeper = self._keeper
-        if keeper is None or self._closed:
+        if self.disk.keeper is None or self._closed:
             return
+        keeper = self._keeper
         for topic in list(self._topics.values()):
             channel = topic.channel
             if channel.watermark > topic.trimmed:
@@ -230,19 +212,12 @@ class DurableTopics:
         del self._topics[stream]
         last = topic.next_seq - 1
         self._found[stream] = KeptStream(stream, _said(stream, channel.stream.info, channel.spec), "", (), last)
-        assert self._keeper is not None
         self._keeper.trim(stream, last)
         self._core.unpublish(channel, now=self._now())
-
-    def _forget(self, stream: StreamId) -> None:
-        assert self._keeper is not None
-        self._found.pop(stream, None)
-        self._keeper.change(Forget(stream))
 
     def _describe(self, topic: _Topic, last: int) -> None:
         stream = topic.channel.stream
         said = _said(stream.id, stream.info, stream.spec)
-        assert self._keeper is not None
         self._keeper.change(Described(stream.id, said, stream.info.definition, tuple(topic.required), last))
 
     # --- from the keeper --------------------------------------------------------------------------------------------
@@ -273,10 +248,7 @@ class DurableTopics:
         if not self._closed:
             self.look()
         self._closed = True
-        if self._keeper is not None:
-            self._keeper.close()
-        else:
-            self._store.close()
+        self.disk.close()
 
 
 def _said(stream: StreamId, info: TopicInfo, spec: TopicSpec) -> dict[str, Any]:

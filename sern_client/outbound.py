@@ -210,6 +210,8 @@ class Outbound:
     def _offer(self, info: TopicInfo, resolved: ResolvedTopic, name: TopicName) -> tuple[OutChannel, Source | None]:
         """Offer a topic to the link, with what its rule makes of it. UsageError when it cannot be."""
         core, spec = self._core, resolved.spec
+        if self._durable is not None and not spec.durable:
+            self._durable.give_way(name)
         if resolved.summaries:
             rule = None if resolved.rule is None else self._site.rules.rules[resolved.rule]
             opened = self.summaries.open(core, info, resolved, rule, name)

@@ -11,9 +11,8 @@ Known are the names of the directory of keys, and whoever has a link or had one.
 The answer is made a few rows in a turn of the loop.
 """
 
-import json
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -25,7 +24,7 @@ from sern_relay.comings import Coming, Comings
 from sern_relay.refusals import Refusals
 from sern_runtime import clock
 from sern_runtime.events import wall_text
-from sern_runtime.http_routes import JsonParts
+from sern_runtime.http_routes import JsonParts, closing_array
 
 TOO_LARGE: Final = "the answer is too large"
 
@@ -46,16 +45,9 @@ class ClientsSource:
 def clients_view(source: ClientsSource) -> JsonParts:
     """The answer. Times by the wall clock are for people; `_s` are how long ago."""
     head = {"name": source.relay, "role": "relay", "time": wall_text(time.time()), "now_s": clock.now()}
-    return JsonParts(_pieces(source, head), TOO_LARGE)
-
-
-def _pieces(source: ClientsSource, head: Mapping[str, object]) -> Iterator[str]:
-    yield json.dumps({**head, **source.refusals.to_json()})[:-1] + ', "clients": ['
-    comma = ""
-    for client in sorted({*source.admission.names, *source.hub.links, *source.comings.clients}):
-        yield comma + json.dumps(client_row(source, client))
-        comma = ", "
-    yield "]}"
+    names = sorted({*source.admission.names, *source.hub.links, *source.comings.clients})
+    rows = (client_row(source, client) for client in names)
+    return JsonParts(closing_array({**head, **source.refusals.to_json()}, "clients", rows), TOO_LARGE)
 
 
 def client_row(source: ClientsSource, client: ClientName) -> dict[str, Any]:

@@ -45,8 +45,7 @@ from sern_runtime.config.load import Loaded
 from sern_runtime.config.relay import RelayFile, load_relay
 from sern_runtime.datagram_watch import DatagramWatch
 from sern_runtime.draining import Progress
-from sern_runtime.durable.keeper import Keeper, Stored
-from sern_runtime.durable.store import Store
+from sern_runtime.durable.disk import Disk
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.events import EventLog
 from sern_runtime.http_routes import Health
@@ -151,7 +150,9 @@ class RelayDaemon:
                 )
         self.durable: DurableHolding | None = None
         if model.durable is not None:
-            self.durable = self._make_durable(loaded.resolve(model.durable.directory), model.durable.max_bytes)
+            self.durable = self._make_durable(
+                Disk.within(loaded.resolve(model.durable.directory), max_bytes=model.durable.max_bytes)
+            )
         self.zap: ZapHandler | None = None
         self.server: RelayServer | None = None
         self.keyring: RelayKeyring | None = None
@@ -172,15 +173,9 @@ class RelayDaemon:
         clients_dir = loaded.model.relay.clients_dir
         return read_directory(None if clients_dir is None else loaded.resolve(clients_dir))
 
-    def _make_durable(self, directory: Path, max_bytes: int) -> DurableHolding:
-        store = Store(directory)
-
-        def keeper(stored: Stored) -> Keeper:
-            call_soon = asyncio.get_running_loop().call_soon_threadsafe
-            return Keeper(store, call_soon=call_soon, stored=stored, max_bytes=max_bytes)
-
+    def _make_durable(self, disk: Disk) -> DurableHolding:
         known, after = self.admission.known, self._after
-        return DurableHolding(store, keeper, self.hub, known=known, now=clock.now, after=after)
+        return DurableHolding(disk, self.hub, known=known, now=clock.now, after=after)
 
     def _own_keys(self) -> OwnKeys | None:
         """The relay's own keys as its files say now. Raises ConfigError."""

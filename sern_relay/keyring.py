@@ -53,7 +53,7 @@ class OwnKeys:
 class RelayKeyring:
     """`session_key(client)`: the key with which the client's session is held, None if that is not known.
 
-    `overlap_s` None: keys of clients are not taken. `changed` is called when other keys of clients are in force.
+    `overlap_s` None: keys of clients are not taken. `after` is called when there is something to send.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class RelayKeyring:
                 self._say(client)
 
     def asked(self, client: ClientName) -> None:
-        """A client would be told, in this session."""
+        """A client wants to be told, until it leaves."""
         self._asked.add(client)
         self._say(client)
 

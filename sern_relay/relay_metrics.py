@@ -56,7 +56,7 @@ def register_relay(metrics: Metrics, relay: Counting) -> None:
     register_received(metrics, hub.received, relay.readers.ages)
     register_codecs(metrics, relay.coder)
     relay.errors.register(metrics)
-    register_durable(metrics, relay.durable)
+    register_durable(metrics, None if relay.durable is None else relay.durable.disk)
     relay.collector.register(metrics)
     relay.parts.register(metrics)
     if relay.adaptation is not None:

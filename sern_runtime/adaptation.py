@@ -1,10 +1,9 @@
 """Runs the adaptation of one or many links on the event loop, and tells what it does: /api/mmcf and metrics."""
 
 import asyncio
-import json
 import logging
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, Final
 
 from sern_core.adaptation.adapter import SAMPLES, HopAdapter
@@ -18,7 +17,7 @@ from sern_core.vocabulary.message import Message, TopicSpec
 from sern_core.vocabulary.types import CLASS_LABELS, CLASSES
 from sern_runtime import clock
 from sern_runtime.config.adaptation import AdaptationSection
-from sern_runtime.http_routes import JsonParts, JsonQuery, array
+from sern_runtime.http_routes import JsonParts, JsonQuery, closing_array
 from sern_runtime.metrics import Labels, Metrics
 from sern_runtime.optional import BACKOFF_S, OptionalParts
 
@@ -141,14 +140,11 @@ class Adaptation:
             text = query.get("last", str(HISTORY))
             if not (text.isascii() and text.isdecimal() and int(text[:9]) <= HISTORY):
                 raise UsageError(f"last is {text[:80]!r}; accepted: 0 to {HISTORY}")
-            return JsonParts(self._pieces(int(text)), TOO_LARGE)
+            last = int(text)
+            links = (self._link_json(link, last) for link in tuple(self._adapters) if link in self._adapters)
+            return JsonParts(closing_array(self._about(), "links", links), TOO_LARGE)
 
         return JsonQuery(("last",), read)
-
-    def _pieces(self, last: int) -> Iterator[str]:
-        yield json.dumps(self._about())[:-1] + ', "links": '
-        yield from array(self._link_json(link, last) for link in tuple(self._adapters) if link in self._adapters)
-        yield "}"
 
     def to_json(self) -> dict[str, Any]:
         """What is in force, and the last intervals of each link, the oldest first, as /api/mmcf tells them."""

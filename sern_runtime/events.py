@@ -10,20 +10,19 @@ An event has a number that rises by one, `time` by the wall clock for people, `a
 """
 
 import asyncio
-import json
 import logging
 import math
 import secrets
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from heapq import merge
 from typing import Any, Final
 
 from sern_core.vocabulary.errors import UsageError
 from sern_runtime import clock
-from sern_runtime.http_routes import JsonParts, JsonQuery
+from sern_runtime.http_routes import JsonParts, JsonQuery, closing_array
 
 MAX_EVENTS: Final = 1000
 MAX_REFUSED: Final = 250
@@ -168,18 +167,9 @@ class EventLog:
                 "last": self.last,
                 "missed": max(0, self.last - after - len(found)),
             }
-            return JsonParts(_pieces(head, found), TOO_LARGE)
+            return JsonParts(closing_array(head, "events", found), TOO_LARGE)
 
         return JsonQuery(("after", "boot", "wait_s"), read, prepare)
-
-
-def _pieces(head: Mapping[str, object], events: list[Event]) -> Iterator[str]:
-    yield json.dumps(head)[:-1] + ', "events": ['
-    comma = ""
-    for event in events:
-        yield comma + json.dumps(event)
-        comma = ", "
-    yield "]}"
 
 
 def _number(event: Event) -> int:

@@ -27,6 +27,13 @@ def array(values: Iterable[object]) -> Iterator[str]:
     return _joined("[]", map(json.dumps, values))
 
 
+def closing_array(head: Mapping[str, object], name: str, values: Iterable[object]) -> Iterator[str]:
+    """The pieces of a JSON object: the members of `head`, and behind them an array, a value each."""
+    yield f"{json.dumps(head)[:-1]}, {json.dumps(name)}: "
+    yield from array(values)
+    yield "}"
+
+
 def table(rows: Iterable[tuple[str, object]]) -> Iterator[str]:
     """The pieces of a JSON object, a member each."""
     return _joined("{}", (f"{json.dumps(name)}: {json.dumps(value)}" for name, value in rows))

@@ -74,9 +74,8 @@ class StreamsIn:
             for identity in self.streams:
                 self._missing.setdefault(identity, now)
         for stream in self.streams.values():
-            if (
-                stream.stream.spec.durable
-            ):  # another process goes on with it, and may encode what is half here otherwise
+            # Another process goes on with what is durable, and may encode otherwise what is half here.
+            if stream.stream.spec.durable:
                 stream.forget(DropReason.DISCONNECTED)
 
     def leave(self) -> None:

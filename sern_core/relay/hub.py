@@ -278,7 +278,7 @@ class Hub:
         link.open_lane(now=now)
 
     def tell_keys(self, client: ClientName, keys: RelayKeys, *, now: float) -> None:
-        """Tell a client that asked in this session of the relay's keys."""
+        """Tell a client of the relay's keys; only one that asked since it connected."""
         link = self.links[client]
         said: framing.Envelope = {"t": "keys", "relay": list(keys.relay), "takes": keys.takes, "key": keys.key,
                                   "code": keys.code, "why": keys.why[:400]}  # fmt: skip

@@ -583,7 +583,7 @@ class ClientCore:
 
     def tell_keys(self, keys: ClientKeys, *, now: float) -> None:
         """Tell the relay which of its keys this side accepts, and which other one of its own it has. Only to a relay
-        that told of its keys in this session."""
+        that has told of its own since we connected."""
         said: framing.Envelope = {"t": "key", "relay": list(keys.relay), "kept": keys.kept, "key": keys.key}
         self.link.control.send(said, now=now)
 

@@ -1,28 +1,14 @@
 """The metrics of what keeps durable topics, of client and relay alike."""
 
-from typing import Protocol
-
-from sern_runtime.durable.keeper import Keeps
+from sern_runtime.durable.disk import Disk
 from sern_runtime.metrics import Metrics
 
 
-class Durable(Protocol):
-    """Who has a keeper, once it has started."""
-
-    damaged: int
-
-    @property
-    def keeper(self) -> Keeps | None: ...
-
-    @property
-    def problem(self) -> str | None: ...
-
-
-def register_durable(metrics: Metrics, durable: Durable | None) -> None:
+def register_durable(metrics: Metrics, disk: Disk | None) -> None:
     """Have `metrics` read it; None: there is nothing, and all of them are 0."""
 
     def read(name: str) -> float:
-        keeper = None if durable is None else durable.keeper
+        keeper = None if disk is None else disk.keeper
         return 0.0 if keeper is None else float(getattr(keeper, name))
 
     metrics.counter(
@@ -46,10 +32,10 @@ def register_durable(metrics: Metrics, durable: Durable | None) -> None:
     metrics.gauge(
         "sern_durable_problem",
         "1 while nothing is put on disk, for the reason that is in the log.",
-        read=lambda: [((), float(durable is not None and durable.problem is not None))],
+        read=lambda: [((), float(disk is not None and disk.problem is not None))],
     )
     metrics.counter(
         "sern_durable_damaged_total",
         "Damaged messages, pages and files that were found when the store was opened.",
-        read=lambda: [((), float(0 if durable is None else durable.damaged))],
+        read=lambda: [((), float(0 if disk is None else disk.damaged))],
     )

@@ -11,7 +11,18 @@ from collections.abc import Callable, Sequence
 from typing import Final, Protocol
 
 from sern_core.vocabulary.message import StreamId
-from sern_runtime.durable.store import ROW_BYTES, Change, Contents, Put, Store, StoreError, Trim
+from sern_runtime.durable.store import (
+    ROW_BYTES,
+    Change,
+    Contents,
+    Described,
+    Forget,
+    Place,
+    Put,
+    Store,
+    StoreError,
+    Trim,
+)
 
 IDLE_S: Final = 0.25
 RETRY_S: Final = 1.0
@@ -45,7 +56,9 @@ class Keeps(Protocol):
 
     def trim(self, stream: StreamId, upto: int) -> None: ...
 
-    def change(self, change: Change) -> None: ...
+    def forget(self, stream: StreamId) -> None: ...
+
+    def change(self, change: Described | Place) -> None: ...
 
     def close(self) -> None: ...
 
@@ -115,7 +128,12 @@ class Keeper:
             self._sizes.pop(stream, None)
         self._add(Trim(stream, upto), urgent=False)
 
-    def change(self, change: Change) -> None:
+    def forget(self, stream: StreamId) -> None:
+        """Let go of a stream with all that is left of it."""
+        self.kept_bytes -= sum(size_bytes for _seq, size_bytes in self._sizes.pop(stream, ()))
+        self._add(Forget(stream), urgent=False)
+
+    def change(self, change: Described | Place) -> None:
         """Whatever else is to be written, in its turn."""
         self._add(change, urgent=False)
 

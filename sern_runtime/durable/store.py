@@ -25,8 +25,6 @@ from sern_runtime.durable.names import DURABLE_FILE
 
 VERSION: Final = 1
 PAGE_BYTES: Final = 8192
-MAX_IDLE_STREAMS: Final = 4096
-"""Streams without messages whose numbers are remembered, the latest."""
 ROW_BYTES: Final = 256
 """What a message takes beside its body."""
 
@@ -86,6 +84,8 @@ class Described:
 
 @dataclass(frozen=True, slots=True)
 class Put:
+    """One more message of a stream that was described."""
+
     stream: StreamId
     row: Row
 

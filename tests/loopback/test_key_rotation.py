@@ -140,6 +140,8 @@ async def test_clients_are_back_at_a_relay_that_goes_over_to_a_new_key(tmp_path:
             await asyncio.to_thread(keys.rotate_relay, loaded, switch=True, force=False, out=print)
             mark = fingerprint(load_secret(tmp_path / "robot1.key").public_key)
             await robot.until(lambda m=mark: relay.json("/api/keys")["clients"]["robot1"]["in_use"] == m, "is back")
+            in_use = relay.json("/api/keys")["relay"]["in_use"]
+            assert in_use == fingerprint(load_secret(tmp_path / "relay.key").public_key)
         await robot.stop()
         await relay.stop()
 

@@ -70,7 +70,7 @@ def test_every_client_has_one_row() -> None:
     relay = Relay(world)
     relay.refusals.note("198.51.100.9", "KEY", "unknown key")
     pieces = relay.pieces("/api/clients")
-    assert len(pieces) == 42
+    assert len(pieces) > 40 and max(map(len, pieces)) < 1000
     told = json.loads("".join(pieces))
     assert {row["name"] for row in told["clients"]} == {f"robot{number}" for number in range(40)}
     row = told["clients"][0]

@@ -8,6 +8,7 @@ from sern_core.stream.out_channel import OutChannel
 from sern_core.vocabulary.message import StreamId, TopicInfo, TopicSpec
 from sern_core.vocabulary.types import Encoding, TopicName
 from sern_relay.durable import DurableHolding
+from sern_runtime.durable.disk import Disk
 from sern_runtime.durable.keeper import Stored
 from sern_runtime.durable.store import (
     ROW_BYTES,
@@ -90,6 +91,9 @@ class SimKeeper:
     def trim(self, stream: StreamId, upto: int) -> None:
         self.change(Trim(stream, upto))
 
+    def forget(self, stream: StreamId) -> None:
+        self.change(Forget(stream))
+
     def change(self, change: Change) -> None:
         self._changes.append(change)
         if not self._busy:
@@ -130,8 +134,7 @@ class DurableRobot:
         self.client = client
         network = self.world.network
         self.topics = DurableTopics(
-            self.disk,
-            lambda stored: SimKeeper(self.world, self.disk, stored),
+            Disk(self.disk, lambda stored: SimKeeper(self.world, self.disk, stored)),
             core=client.core,
             now=lambda: client.now,
             wall_ns=lambda: 10**18 + int(network.now * 1e9),
@@ -167,8 +170,7 @@ class DurableRelay:
         """Another process has begun."""
         network, relay = self.world.network, self.world.relay
         self.holding = DurableHolding(
-            self.disk,
-            lambda stored: SimKeeper(self.world, self.disk, stored),
+            Disk(self.disk, lambda stored: SimKeeper(self.world, self.disk, stored)),
             relay.hub,
             known=lambda _client: True,
             now=lambda: relay.now,

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from sern_core.vocabulary.errors import UsageError
 from sern_core.vocabulary.message import TopicSpec
 from sern_core.vocabulary.types import PriorityClass, Reliability
 from sern_sim.models import LinkModel, Window
@@ -125,3 +126,24 @@ def test_a_full_disk_of_the_relay_leaves_messages_with_the_robot() -> None:
     play.world.run(2.0)
     play.relay.disk.full = False
     play.check()
+
+
+def test_a_topic_that_is_not_durable_any_more_leaves_nothing() -> None:
+    """Its stream ends, what is left on disk goes, and the name is free for a topic of another rule."""
+    play = Play(7)
+    play.world.run(1.0)
+    play.stop()
+    robot = play.robot
+    robot.disk.commit_s = 0.0
+    robot.topics.give_way(robot.info.name)
+    play.world.run(1.0)
+    assert robot.disk.contents is not None
+    assert [kept.rows for kept in robot.disk.contents.streams.values()] == [[]]
+    client = robot.client
+    client.core.publish(robot.info, replace(SPEC, durable=False), now=client.now)
+
+
+def test_a_name_is_offered_once() -> None:
+    robot = Play(8).robot
+    with pytest.raises(UsageError, match=r"/robot/log is offered already"):
+        robot.topics.publish(robot.info, SPEC)

@@ -117,3 +117,16 @@ async def test_room_is_counted(tmp_path: Path) -> None:
     keeper.trim(STREAM, 1)
     assert keeper.has_room(100) and not keeper.has_room(101)
     keeper.close()
+
+
+async def test_a_stream_that_is_forgotten_frees_its_room(tmp_path: Path) -> None:
+    got: list[int] = []
+    keeper = make(Store(tmp_path), got, max_bytes=2 * (10 + ROW_BYTES))
+    keeper.start()
+    keeper.put(put(1))
+    keeper.put(put(2))
+    assert not keeper.has_room(10)
+    keeper.forget(STREAM)
+    assert keeper.has_room(10) and keeper.kept_bytes == 0
+    keeper.close()
+    assert STREAM not in Store(tmp_path).open(new_boot=1).streams
