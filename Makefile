@@ -10,7 +10,7 @@ PACKAGES := sern_core sern_runtime sern_relay sern_client sern_sim sern_twin ser
 # quarter less of CPU, and each worker of the tests would rewrite all of them anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup lint format types test wheel compiled test-compiled explore standstills lab bench performance endpoints figures cellular navigation picture demo demo-twin demo-navigation schemas clean
+.PHONY: help setup lint format types test wheel compiled test-compiled explore standstills soak fuzz kills lab bench performance endpoints figures cellular navigation picture demo demo-twin demo-navigation schemas clean
 
 help:
 	@echo "make setup    create $(VENV) with pinned dependencies"
@@ -22,6 +22,8 @@ help:
 	@echo "make compiled an environment with that wheel, .venv-compiled, also for benchmarks"
 	@echo "make explore  the tests with random input, with new cases and ten times as many; SEED=... repeats a run"
 	@echo "make standstills   the tests whose processes stand still for moments, as on a loaded machine; SEED=..."
+	@echo "make soak     ten minutes of robots that come and go: memory and open files;  make kills: 1,000 times kill -9"
+	@echo "make fuzz     made-up input for what reads bytes of others, a minute each; build/fuzz keeps what it learns"
 	@echo "make lab      the whole matrix of bad links, and the longer runs over tc netem, which need root"
 	@echo "make performance   as root: measure link, fleet and policies of docs/performance.md anew, two hours of an idle machine"
 	@echo "make endpoints, make figures   the other tables: ROS endpoints, 20 minutes; virtual time, summaries and codecs, 30"
@@ -87,12 +89,23 @@ explore: setup
 # Those with processes of their own. Not the lab: it measures, and has the machine for itself.
 standstills: setup
 	$(BIN)/python -m tests.standstills $(SEED) -q -n $(TEST_PROCESSES) --dist loadgroup tests/sern_client tests/sern_relay \
-		tests/sern_runtime tests/sern_tools tests/loopback tests/peers tests/deploy tests/benchmarks
+		tests/sern_runtime tests/sern_tools tests/loopback tests/hazards tests/peers tests/deploy tests/benchmarks
 
 # Of the matrix also the quarter that is in every `make test`.
 lab: setup
 	$(BIN)/python -m pytest tests/matrix -m 'lab_long or not lab_long' --figures build/matrix.json
 	$(BIN)/python -m pytest tests/lab -m lab_long
+
+# What finds what tests of a known case do not. Inputs that the fuzzer has learned from stay in build/fuzz.
+soak: setup
+	mkdir -p build
+	$(BIN)/python -m benchmarks.soak --json build/soak.json
+
+fuzz: setup
+	$(BIN)/python -m tests.fuzz
+
+kills: setup
+	$(BIN)/python -m tests.hazards.kills
 
 bench: setup
 	$(BIN)/python -m benchmarks.scheduler --quick

@@ -159,7 +159,9 @@ class DurableTopics:
         def keep(body: bytes, stamp_ns: int, born_s: float | None) -> bool:
             size = len(body)
             overhead_bytes = MESSAGE_OVERHEAD_BYTES * len(topic.waiting)
-            if not keeper.has_room(size) or not channel.has_room(size + topic.waiting_bytes + overhead_bytes):
+            if not keeper.has_room(self._core.name, size) or not channel.has_room(
+                size + topic.waiting_bytes + overhead_bytes
+            ):
                 channel.counters.refuse(size)
                 return False
             now = self._now()

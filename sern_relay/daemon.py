@@ -53,6 +53,7 @@ from sern_runtime.internal_errors import InternalErrors
 from sern_runtime.loop import Shutdown
 from sern_runtime.message_log import LoggedFates, MessageLog
 from sern_runtime.metrics import Metrics
+from sern_runtime.open_files import require_open_files
 from sern_runtime.optional import OptionalParts
 from sern_runtime.sdnotify import Notifier, Watchdog
 from sern_runtime.zap import ZapHandler, self_test
@@ -63,6 +64,8 @@ if TYPE_CHECKING:
 PATIENCE_S: Final = 5.0
 """How long a stopping relay waits for the next sign that what it holds for connected clients gets further."""
 SWEEP_S: Final = 1.0
+OTHER_FILES: Final = 128
+"""What a relay has open beside the connections of clients."""
 OTHER_CODE: Final = "other"
 REFUSAL_CODES: Final = frozenset({
     "bad_announcement", "bad_id", "bad_name", "bad_object", "bad_pattern", "displaced", "forbidden",
@@ -151,7 +154,7 @@ class RelayDaemon:
         self.durable: DurableHolding | None = None
         if model.durable is not None:
             self.durable = self._make_durable(
-                Disk.within(loaded.resolve(model.durable.directory), max_bytes=model.durable.max_bytes)
+                Disk.within(loaded.resolve(model.durable.directory), max_bytes=model.durable.max_bytes, shared=True)
             )
         self.zap: ZapHandler | None = None
         self.server: RelayServer | None = None
@@ -197,6 +200,8 @@ class RelayDaemon:
         if self.durable is not None:
             with blamed_on(self.loaded.path, "durable", "directory"):
                 self.durable.start()
+        with blamed_on(self.loaded.path, "relay", "max_connections"):
+            require_open_files(relay.max_connections + OTHER_FILES)
         self._ctx = zmq.Context()
         self.readers.transforms = TransformObjects(self.hub.objects, parts=self.parts)
         if own is not None:

@@ -83,7 +83,7 @@ class DurableHolding:
 
     def put(self, message: Message, *, now: float) -> bool:
         keeper = self._writes
-        if keeper is None or not keeper.has_room(len(message.body)):
+        if keeper is None or not keeper.has_room(message.stream.origin, len(message.body)):
             return False
         born_ns = self._wall_ns() - int((now - message.born_s) * 1e9)
         row = Row(message.seq, born_ns, message.stamp_ns, message.body, int(message.codec), message.drop_marker)

@@ -20,6 +20,7 @@ from sern_runtime.config.keys import KeyStatus, parse_user_id, user_id
 from sern_runtime.dscp import Marks
 from sern_runtime.inflow import Inflow
 from sern_runtime.monitor import ConnectionTable, TcpHandle
+from sern_runtime.open_files import close_reserve
 from sern_runtime.pump import LANE_MESSAGE_BYTES, Pump
 from sern_runtime.zmq_setup import CurvePair, bind_all, make_server, serve_curve, unbind
 from sern_runtime.zmq_socket import RouterSocket, SendResult
@@ -210,6 +211,7 @@ class RelayServer:
     def look(self) -> None:
         """See to connections. Call about once a second."""
         self.silent += self.connections.cut_silent(self._silent_s)
+        close_reserve()
         self._bind()
         self.priority_lanes.look()
 

@@ -4,7 +4,6 @@ import asyncio
 import logging
 import math
 import os
-import resource
 import signal
 import sys
 import threading
@@ -17,11 +16,10 @@ from typing import Any, Final, Protocol, Self
 import uvloop
 
 from sern_runtime.clock import now
+from sern_runtime.open_files import raise_open_files
 
 KEPT_BYTES: Final = 16 * 2**20
 """Freed memory that a process keeps at the top of a heap."""
-OPEN_FILES: Final = 16_384
-"""How many files a daemon wants to be able to open, one for each connection; as in the systemd units."""
 
 _log = logging.getLogger(__name__)
 _STOP_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT)
@@ -74,19 +72,6 @@ def keep_freed_memory() -> None:
     """
     block = bytes(KEPT_BYTES // 2)
     del block
-
-
-def raise_open_files() -> int:
-    """Let this process open as many files as it may, up to what its systemd units allow; the limit that holds now.
-
-    A shell gives 1,024, of which half-open connections of strangers could take most.
-    """
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = OPEN_FILES if hard == resource.RLIM_INFINITY else min(OPEN_FILES, hard)
-    if soft != resource.RLIM_INFINITY and soft < wanted:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
-        return wanted
-    return soft
 
 
 def run(main: Callable[[Shutdown], Coroutine[Any, Any, int | None]]) -> int:

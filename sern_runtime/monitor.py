@@ -26,6 +26,7 @@ import zmq
 
 from sern_runtime.addresses import plain_host
 from sern_runtime.clock import now
+from sern_runtime.open_files import open_reserve
 from sern_runtime.zmq_setup import HANDSHAKE_IVL_MS
 from sern_runtime.zmq_socket import FrameSocket
 
@@ -132,17 +133,28 @@ class TcpInfo:
     delivery_rate_bps: int
 
 
+def _duplicate(fd: int) -> int:
+    """Another number for what is open as `fd`, of the reserve where there is none else: who is one too many could not
+    be cut off otherwise. OSError where nothing is open."""
+    try:
+        return os.dup(fd)
+    except OSError as error:
+        if error.errno != errno.EMFILE or not open_reserve():
+            raise
+    return os.dup(fd)
+
+
 @contextmanager
 def _peek(fd: int) -> Iterator[tuple[int, socketlib.socket | None]]:
     """The inode of what `fd` is, and that socket through a duplicate that lives as long as the block; None where it is
     none. OSError where nothing is open."""
-    duplicate = os.dup(fd)
+    duplicate = _duplicate(fd)
     try:
         status = os.fstat(duplicate)
         if not stat.S_ISSOCK(status.st_mode):
             yield status.st_ino, None
             return
-        with socketlib.socket(fileno=os.dup(duplicate)) as connection:
+        with socketlib.socket(fileno=_duplicate(duplicate)) as connection:
             yield status.st_ino, connection
     finally:
         os.close(duplicate)
@@ -185,7 +197,7 @@ class SocketHandle:
     def _connection(self) -> Iterator[socketlib.socket | None]:
         """The connection through a duplicate that lives as long as the block; None when it is gone."""
         try:
-            duplicate = os.dup(self.fd)
+            duplicate = _duplicate(self.fd)
         except OSError:
             yield None
             return
@@ -258,7 +270,9 @@ class TcpHandle(SocketHandle):
         with self._connection() as connection:
             if connection is None:
                 return None
-            return socketlib.socket(fileno=os.dup(connection.fileno()))  # `dup()` would make libzmq's socket blocking
+            return socketlib.socket(
+                fileno=_duplicate(connection.fileno())
+            )  # `dup()` would make libzmq's socket blocking
 
     def congestion(self) -> str | None:
         """The name of the congestion control, for example `cubic`."""
@@ -503,7 +517,8 @@ class ConnectionTable:
                 self._gone(event.value)
             case EventKind.ACCEPT_FAILED:
                 self.accept_failed += 1
-                _log.warning("a connection could not be accepted: %s", os.strerror(event.value))
+                if event.value != errno.EMFILE or not open_reserve():
+                    _log.warning("a connection could not be accepted: %s", os.strerror(event.value))
             case EventKind.HANDSHAKE_SUCCEEDED:
                 pass
             case _:

@@ -20,7 +20,7 @@ import zmq
 from sern_core.vocabulary.types import ClientName
 from sern_runtime import version
 from sern_runtime.config.keys import SecretKey, generate
-from sern_runtime.loop import raise_open_files
+from sern_runtime.open_files import raise_open_files
 from sern_tools.ports import release_claims
 from tests.exploring import load_profile
 from tests.support import DEADLINE_S, LASTING, Patience, open_sockets

@@ -108,6 +108,7 @@ class Process:
         self._before = before
         self._program = program
         self._from = 0
+        self._port = 0
         with self.log.open("ab") as stream:
             self._from = stream.tell()
             command = bound([*before, *daemon(program, config)])
@@ -126,9 +127,11 @@ class Process:
 
     @property
     def port(self) -> int:
-        """Its HTTP port."""
-        content: Json = json.loads(self.config.read_text())
-        return int(content["http"]["listen"].rpartition(":")[2])
+        """Its HTTP port, as its file said when it was first asked."""
+        if not self._port:
+            content: Json = json.loads(self.config.read_text())
+            self._port = int(content["http"]["listen"].rpartition(":")[2])
+        return self._port
 
     def get(self, path: str) -> tuple[int, str]:
         """Status and body of a GET; (0, "") while nobody listens, and where there is no answer in a test's deadline."""
@@ -348,6 +351,14 @@ def delivered(site: ClientDaemon | Process, topic: str | None = None) -> int:
     else:
         counts = {name: counters.delivered for name, counters in site.core.received.topics.items()}
     return sum(counts.values()) if topic is None else counts.get(topic, 0)
+
+
+def metric(process: Process, name: str, **labels: str) -> int:
+    """A metric, summed over all its series that have these labels; 0 before the daemon answers."""
+    _status, text = process.get("/metrics")
+    wanted = [f'{key}="{value}"' for key, value in labels.items()]
+    lines = [line for line in text.splitlines() if line.startswith((f"{name} ", f"{name}{{"))]
+    return sum(int(float(line.rpartition(" ")[2])) for line in lines if all(label in line for label in wanted))
 
 
 def rss_bytes(process: Process) -> int:

@@ -25,13 +25,13 @@ class Disk:
         """Messages, and other things, that could not be read when the store was opened."""
 
     @classmethod
-    def within(cls, directory: Path, *, max_bytes: int) -> "Disk":
+    def within(cls, directory: Path, *, max_bytes: int, shared: bool = False) -> "Disk":
         """The files in this directory; to be opened in a running loop."""
         store = Store(directory)
 
         def keeper(stored: Stored) -> Keeper:
             call_soon = asyncio.get_running_loop().call_soon_threadsafe
-            return Keeper(store, call_soon=call_soon, stored=stored, max_bytes=max_bytes)
+            return Keeper(store, call_soon=call_soon, stored=stored, max_bytes=max_bytes, shared=shared)
 
         return cls(store, keeper)
 

@@ -6,11 +6,12 @@ shares it. What only makes room (`Trim`, `Place`) waits for company, `IDLE_S` at
 
 import logging
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from typing import Final, Protocol
 
 from sern_core.vocabulary.message import StreamId
+from sern_core.vocabulary.types import ClientName
 from sern_runtime.durable.store import (
     ROW_BYTES,
     Change,
@@ -48,7 +49,7 @@ class Keeps(Protocol):
 
     def start(self) -> None: ...
 
-    def has_room(self, size_bytes: int) -> bool: ...
+    def has_room(self, origin: ClientName, size_bytes: int) -> bool: ...
 
     def found(self, stream: StreamId, seq: int, size_bytes: int) -> None: ...
 
@@ -73,7 +74,11 @@ class OpensStore(Protocol):
 
 class Keeper:
     """`stored(changes)` is called in the loop, by `call_soon`, with what is on disk now, in its order. `problem`: why
-    nothing gets there, None: it does."""
+    nothing gets there, None: it does.
+
+    `shared`: an origin may have no more than is left free then, so that none can take the room of the others: one alone
+    has half of it, of n each the part 1/(n + 1) (dynamic thresholds with α = 1, Choudhury and Hahne 1998).
+    """
 
     def __init__(
         self,
@@ -82,17 +87,20 @@ class Keeper:
         call_soon: Callable[..., object],
         stored: Stored,
         max_bytes: int,
+        shared: bool = False,
     ) -> None:
         self._store = store
         self._call_soon = call_soon
         self._stored = stored
         self._max_bytes = max_bytes
+        self._shared = shared
         self._changes: deque[Change] = deque()
         self._urgent = 0  # of those, how many somebody waits for
         self._closing = False
         self._condition = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="durable", daemon=True)
         self._sizes: dict[StreamId, deque[tuple[int, int]]] = {}  # of what is kept: seq, bytes
+        self._of: Counter[ClientName] = Counter()
         self.kept_bytes = 0
         """What is kept, or about to be, overhead included."""
         self.problem: str | None = None
@@ -105,14 +113,22 @@ class Keeper:
     def start(self) -> None:
         self._thread.start()
 
-    def has_room(self, size_bytes: int) -> bool:
+    def has_room(self, origin: ClientName, size_bytes: int) -> bool:
         """Whether a message of this size may be put."""
-        return self.kept_bytes + size_bytes + ROW_BYTES <= self._max_bytes
+        needed = size_bytes + ROW_BYTES
+        free = self._max_bytes - self.kept_bytes
+        return needed + (self._of[origin] if self._shared else 0) <= free
 
     def found(self, stream: StreamId, seq: int, size_bytes: int) -> None:
         """This message was in the store from the beginning."""
         self._sizes.setdefault(stream, deque()).append((seq, size_bytes + ROW_BYTES))
-        self.kept_bytes += size_bytes + ROW_BYTES
+        self._count(stream, size_bytes + ROW_BYTES)
+
+    def _count(self, stream: StreamId, more_bytes: int) -> None:
+        self.kept_bytes += more_bytes
+        self._of[stream.origin] += more_bytes
+        if not self._of[stream.origin]:
+            del self._of[stream.origin]
 
     def put(self, change: Put) -> None:
         """Keep a message; the seqs of a stream rise."""
@@ -123,14 +139,14 @@ class Keeper:
         """Let go of what is delivered."""
         sizes = self._sizes.get(stream, ())
         while sizes and sizes[0][0] <= upto:
-            self.kept_bytes -= sizes.popleft()[1]
+            self._count(stream, -sizes.popleft()[1])
         if not sizes:
             self._sizes.pop(stream, None)
         self._add(Trim(stream, upto), urgent=False)
 
     def forget(self, stream: StreamId) -> None:
         """Let go of a stream with all that is left of it."""
-        self.kept_bytes -= sum(size_bytes for _seq, size_bytes in self._sizes.pop(stream, ()))
+        self._count(stream, -sum(size_bytes for _seq, size_bytes in self._sizes.pop(stream, ())))
         self._add(Forget(stream), urgent=False)
 
     def change(self, change: Described | Place) -> None:

@@ -12,8 +12,8 @@ from sern_client.daemon import ClientDaemon
 from sern_relay.daemon import RelayDaemon
 from sern_runtime import datagram_watch
 from sern_tools.ports import free_ports
+from tests.between import INSIDE, Nat
 from tests.daemons import HOST, Lab
-from tests.loopback.test_nat import INSIDE, Nat
 from tests.support import until
 
 PATIENCE_S = 0.4

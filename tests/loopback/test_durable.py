@@ -5,7 +5,7 @@ from pathlib import Path
 from sern_client.endpoints.bag_files import BagFile
 from sern_core.vocabulary.types import Encoding
 from sern_runtime.ros_types import topic_info
-from tests.daemons import Lab, Process, bodies
+from tests.daemons import Lab, bodies, metric
 
 COUNT = 3000
 TOPIC = "/robot1/chat"
@@ -22,12 +22,6 @@ def write_bag(path: Path, name: str, count: int) -> Path:
         file.write(info, 10**18 + number * 10**6, len(text).to_bytes(4, "little") + text)
     file.finish()
     return path
-
-
-def metric(process: Process, name: str) -> int:
-    """A metric without labels; 0 before the daemon answers."""
-    _status, text = process.get("/metrics")
-    return sum(int(float(line.split()[1])) for line in text.splitlines() if line.startswith(f"{name} "))
 
 
 async def test_what_a_killed_robot_has_stored_arrives_once_and_in_order(tmp_path: Path) -> None:
@@ -110,6 +104,7 @@ async def test_robot_and_relay_go_on_together_after_both_were_killed(tmp_path: P
         relay = lab.process(relay_file)
         await relay.said("messages of durable topics of an earlier run wait for their clients")
         robot = lab.process(lab.player_file("robot1", other, play={"rate": 1}, topics=RULES, durable=durable))
+        await robot.said("messages of an earlier run are sent now")
         await robot.until(lambda: metric(robot, "sern_durable_kept_bytes") == 0, "has had all of it stored")
         site = lab.process(lab.recorder_file("site1", "/.*", path="later"))
         await relay.until(lambda: metric(relay, "sern_durable_kept_bytes") == 0, "has delivered all of it")

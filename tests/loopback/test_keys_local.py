@@ -9,7 +9,8 @@ from sern_core.vocabulary.types import ClientName
 from sern_runtime.config.keys import PublicKey, PublicKeys, generate, load_public, load_secret, write_public
 from sern_runtime.monitor import ConnectionTable
 from tests.daemons import Lab
-from tests.loopback.test_security import DEAD_ENDS, Stranger, hello
+from tests.loopback.test_security import DEAD_ENDS
+from tests.strangers import Stranger, hello
 from tests.support import until
 
 

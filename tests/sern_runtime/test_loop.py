@@ -3,7 +3,6 @@
 import asyncio
 import os
 import platform
-import resource
 import signal
 import subprocess
 import sys
@@ -14,7 +13,7 @@ import pytest
 import uvloop
 
 from sern_runtime import clock
-from sern_runtime.loop import OPEN_FILES, BlockDetector, Shutdown, Timer, raise_open_files, run
+from sern_runtime.loop import BlockDetector, Shutdown, Timer, run
 from tests.support import DEADLINE_S, Patience, child, until
 
 
@@ -244,24 +243,3 @@ def test_freed_memory_is_kept_for_the_next_message() -> None:
 
     # Set by hand it stays: else what was freed while importing may have raised it already.
     assert faults("keep") < faults("give", MALLOC_TRIM_THRESHOLD_="131072") / 10
-
-
-@pytest.mark.parametrize(
-    ("limits", "expected"),
-    [
-        ((1024, 4096), (4096, 4096)),
-        ((1024, 10**6), (OPEN_FILES, 10**6)),
-        ((1024, resource.RLIM_INFINITY), (OPEN_FILES, resource.RLIM_INFINITY)),
-        ((10**5, 10**6), (10**5, 10**6)),
-        ((resource.RLIM_INFINITY, resource.RLIM_INFINITY), (resource.RLIM_INFINITY, resource.RLIM_INFINITY)),
-        ((512, 512), (512, 512)),
-    ],
-)
-def test_a_daemon_may_open_more_files_than_a_shell_gives(
-    limits: tuple[int, int], expected: tuple[int, int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    now = [limits]
-    monkeypatch.setattr(resource, "getrlimit", lambda which: now[0])
-    monkeypatch.setattr(resource, "setrlimit", lambda which, both: now.__setitem__(0, both))
-    assert raise_open_files() == expected[0]
-    assert now == [expected]

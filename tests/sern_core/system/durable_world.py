@@ -6,7 +6,7 @@ from copy import deepcopy
 from sern_client.durable import DurableTopics
 from sern_core.stream.out_channel import OutChannel
 from sern_core.vocabulary.message import StreamId, TopicInfo, TopicSpec
-from sern_core.vocabulary.types import Encoding, TopicName
+from sern_core.vocabulary.types import ClientName, Encoding, TopicName
 from sern_relay.durable import DurableHolding
 from sern_runtime.durable.disk import Disk
 from sern_runtime.durable.keeper import Stored
@@ -80,7 +80,7 @@ class SimKeeper:
 
     def start(self) -> None: ...
 
-    def has_room(self, size_bytes: int) -> bool:
+    def has_room(self, origin: ClientName, size_bytes: int) -> bool:
         return self.kept_bytes + size_bytes + ROW_BYTES <= self._max_bytes
 
     def found(self, stream: StreamId, seq: int, size_bytes: int) -> None: ...

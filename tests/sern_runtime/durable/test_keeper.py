@@ -13,6 +13,7 @@ from sern_runtime.durable.store import ROW_BYTES, Change, Described, Put, Row, S
 from tests.support import until
 
 STREAM = StreamId(ClientName("robot1"), 7, TopicName("/robot1/log"))
+OTHER = StreamId(ClientName("robot2"), 7, TopicName("/robot2/log"))
 
 
 class Gate(Store):
@@ -30,15 +31,16 @@ class Gate(Store):
         self.batches.append(sum(isinstance(change, Put) for change in changes))
 
 
-def make(store: Store, got: list[int], *, max_bytes: int = 2**20) -> Keeper:
+def make(store: Store, got: list[int], *, max_bytes: int = 2**20, shared: bool = False) -> Keeper:
     store.open(new_boot=7)
 
     def stored(puts: Sequence[Put]) -> None:
         got.extend(change.row.seq for change in puts)
 
     call_soon = asyncio.get_running_loop().call_soon_threadsafe
-    keeper = Keeper(store, call_soon=call_soon, stored=stored, max_bytes=max_bytes)
-    keeper.change(Described(STREAM, {}, "", (), 0))
+    keeper = Keeper(store, call_soon=call_soon, stored=stored, max_bytes=max_bytes, shared=shared)
+    for stream in (STREAM, OTHER):
+        keeper.change(Described(stream, {}, "", (), 0))
     return keeper
 
 
@@ -110,12 +112,12 @@ async def test_closing_with_a_full_disk_says_what_is_not_kept(tmp_path: Path, ca
 async def test_room_is_counted(tmp_path: Path) -> None:
     keeper = make(Store(tmp_path), [], max_bytes=2 * (100 + ROW_BYTES))
     keeper.start()
-    assert keeper.has_room(100)
+    assert keeper.has_room(STREAM.origin, 100)
     keeper.put(put(1, 100))
     keeper.put(put(2, 100))
-    assert not keeper.has_room(0) and keeper.kept_bytes == 2 * (100 + ROW_BYTES)
+    assert not keeper.has_room(STREAM.origin, 0) and keeper.kept_bytes == 2 * (100 + ROW_BYTES)
     keeper.trim(STREAM, 1)
-    assert keeper.has_room(100) and not keeper.has_room(101)
+    assert keeper.has_room(STREAM.origin, 100) and not keeper.has_room(STREAM.origin, 101)
     keeper.close()
 
 
@@ -125,8 +127,28 @@ async def test_a_stream_that_is_forgotten_frees_its_room(tmp_path: Path) -> None
     keeper.start()
     keeper.put(put(1))
     keeper.put(put(2))
-    assert not keeper.has_room(10)
+    assert not keeper.has_room(STREAM.origin, 10)
     keeper.forget(STREAM)
-    assert keeper.has_room(10) and keeper.kept_bytes == 0
+    assert keeper.has_room(STREAM.origin, 10) and keeper.kept_bytes == 0
     keeper.close()
     assert STREAM not in Store(tmp_path).open(new_boot=1).streams
+
+
+async def test_an_origin_leaves_as_much_free_as_it_has(tmp_path: Path) -> None:
+    """So that one which fills its share, and more than one, leave room for those that come later."""
+    size = 1000 - ROW_BYTES
+    keeper = make(Store(tmp_path), [], max_bytes=12_000, shared=True)
+    keeper.start()
+
+    def fill(stream: StreamId) -> int:
+        count = 0
+        while keeper.has_room(stream.origin, size):
+            count += 1
+            keeper.put(Put(stream, Row(count, 0, 0, bytes(size))))
+        return count
+
+    assert (fill(STREAM), fill(OTHER)) == (6, 3)
+    assert not keeper.has_room(STREAM.origin, size)
+    keeper.forget(STREAM)
+    assert keeper.has_room(OTHER.origin, size)
+    keeper.close()
