@@ -10,16 +10,19 @@ A fault ends it with 1, and its input stays in the corpus as `failure-...`; `--r
 """
 
 import argparse
+import re
 import sys
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
 
 from sern_core.wire import framing
 from sern_core.wire.announce import decode_announcement
 from sern_runtime.seal import Cipher, Opener, Sealer, SessionParameters, Side
-from tests.fuzz import test_fuzz_config
 from tests.fuzz.fuzzer import Corpus, FoundError, Fuzzer
+from tests.fuzz.fuzzer import Target as Ready
+from tests.fuzz.test_fuzz_config import checked
 from tests.fuzz.test_fuzz_wire import BAD, GOOD, Duet, assert_in_order_after, tried
 from tests.make_vectors import decode
 from tests.world import World
@@ -30,7 +33,9 @@ LENGTH_BYTES: Final = 2
 
 
 class Target(NamedTuple):
-    try_: Callable[[bytes], object]
+    """What is tried, as `fuzzer.Target` says."""
+
+    ready: Ready
     seeds: Callable[[], Iterable[bytes]]
     watched: tuple[str, ...]
     """Folders and files whose lines count."""
@@ -44,15 +49,19 @@ def wire(data: bytes) -> None:
         tried(lambda: decode_announcement(said[0]))
 
 
-def handshake(data: bytes) -> None:
+def handshake(data: bytes) -> Callable[[], object]:
     world = World()
     client = world.client("robot")
     port = world.relay.port(client.name)
     port.connected(now=0.0)
-    if tried(lambda: port.receive(data, now=0.0)):
-        while port.next_datagram(now=0.0) is not None:
-            pass
-    world.relay.hub.validate()
+
+    def said() -> None:
+        if tried(lambda: port.receive(data, now=0.0)):
+            while port.next_datagram(now=0.0) is not None:
+                pass
+        world.relay.hub.validate()
+
+    return said
 
 
 def split(data: bytes) -> list[bytes]:
@@ -69,8 +78,8 @@ def joined(datagrams: Iterable[bytes]) -> bytes:
     return b"".join(len(datagram).to_bytes(LENGTH_BYTES, "big") + datagram for datagram in datagrams)
 
 
-def datagram(data: bytes) -> None:
-    assert_in_order_after(split(data[1:]), to_relay=data[:1] < b"\x80")
+def datagram(data: bytes) -> Callable[[], object]:
+    return partial(assert_in_order_after, split(data[1:]), to_relay=data[:1] < b"\x80", duet=Duet())
 
 
 def datagram_seeds() -> Iterable[bytes]:
@@ -98,18 +107,20 @@ def sealed_seeds() -> Iterable[bytes]:
 
 
 def examples() -> Iterable[bytes]:
+    """Sections of the example files: the whole of one takes long to read."""
     for path in sorted((ROOT / "deploy" / "examples").glob("*.yaml")):
-        yield path.read_bytes()
+        sections = re.split(r"\n(?=\w)", re.sub(r"(?m)\s*#.*$", "", path.read_text()))
+        yield from (section.encode() for section in sections if section.strip())
 
 
 CORE: Final = str(ROOT / "sern_core")
 CONFIG: Final = str(ROOT / "sern_runtime" / "config")
 TARGETS: Final = {
-    "wire": Target(wire, lambda: VECTORS, (CORE,)),
+    "wire": Target(lambda data: partial(wire, data), lambda: VECTORS, (CORE,)),
     "handshake": Target(handshake, lambda: VECTORS, (CORE,)),
     "datagram": Target(datagram, datagram_seeds, (CORE,)),
-    "sealed": Target(sealed, sealed_seeds, (str(ROOT / "sern_runtime" / "seal.py"),)),
-    "config": Target(test_fuzz_config.checked, examples, (CONFIG,)),
+    "sealed": Target(lambda data: partial(sealed, data), sealed_seeds, (str(ROOT / "sern_runtime" / "seal.py"),)),
+    "config": Target(lambda data: partial(checked, data), examples, (CONFIG,)),
 }
 
 
@@ -127,11 +138,11 @@ def main(arguments: list[str] | None = None) -> int:
     for name in options.targets or TARGETS:
         target = TARGETS[name]
         if options.replay is not None:
-            target.try_(options.replay.read_bytes())
+            target.ready(options.replay.read_bytes())()
             continue
         corpus = Corpus(options.corpus / name)
         try:
-            fuzzer = Fuzzer(target.try_, target.seeds(), corpus, watched=target.watched, seed=options.seed)
+            fuzzer = Fuzzer(target.ready, target.seeds(), corpus, watched=target.watched, seed=options.seed)
             fuzzer.run(seconds=options.seconds)
         except FoundError as error:
             print(f"{name}: {error}", file=sys.stderr)

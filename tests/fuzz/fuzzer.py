@@ -17,7 +17,8 @@ INTERESTING: Final = (
     b"\xdf\xff\xff\xff\xff", b"\xdd\xff\xff\xff\xff", b"\xc0", b"\xcb\x7f\xf0\0\0\0\0\0\0", b": ", b"\n", b"- ", b"&a ",
     b"*a", b"[", b"{", b'"', b"\\u", b"%", b"\xed\xa0\x80", b"1e400", b"-1",
 )  # fmt: skip
-Target = Callable[[bytes], object]
+Target = Callable[[bytes], Callable[[], object]]
+"""`target(data)()` tries one input. What the first call does, such as making a session, is not watched, and is fast."""
 Line = tuple[CodeType, int]
 
 
@@ -104,7 +105,7 @@ class FoundError(Exception):
 
 
 class Fuzzer:
-    """Tries inputs on `target`, which raises nothing but what is a fault. Begins with `seeds` and the corpus.
+    """Tries inputs on `target`: whatever it raises is a fault. Begins with `seeds` and the corpus.
 
     Raises FoundError at the first fault."""
 
@@ -137,6 +138,6 @@ class Fuzzer:
     def _try(self, data: bytes) -> bool:
         self.tried += 1
         try:
-            return self._coverage.new(lambda: self._target(data))
+            return self._coverage.new(self._target(data))
         except Exception as error:
             raise FoundError(self.corpus.failed(data), error) from error

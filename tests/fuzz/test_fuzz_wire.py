@@ -205,9 +205,9 @@ SAID: Final = DUET.said
 TAG: Final = DUET.link.end.tag
 
 
-def assert_in_order_after(datagrams: list[bytes], *, to_relay: bool) -> None:
+def assert_in_order_after(datagrams: list[bytes], *, to_relay: bool, duet: Duet | None = None) -> None:
     """Feed one side of a fresh session, up to the first error, as its shell would; then both must be in order."""
-    duet = Duet()
+    duet = duet or Duet()
     target = duet.port if to_relay else duet.link
     for data in datagrams:
         if not tried(lambda data=data: target.receive(data, now=duet.now)):  # type: ignore[misc]

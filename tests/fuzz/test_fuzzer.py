@@ -1,5 +1,6 @@
 """The fuzzer finds what is there to be found, keeps what it has learned, and says which input it was."""
 
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -23,7 +24,8 @@ def fails_at_the_word(data: bytes) -> None:
 
 
 def fuzzer(directory: Path, seed: int = 1) -> Fuzzer:
-    return Fuzzer(fails_at_the_word, [b"...."], Corpus(directory), watched=(__file__,), seed=seed)
+    corpus = Corpus(directory)
+    return Fuzzer(lambda data: partial(fails_at_the_word, data), [b"...."], corpus, watched=(__file__,), seed=seed)
 
 
 def test_it_gets_behind_branches_one_by_one(tmp_path: Path) -> None:
@@ -48,7 +50,7 @@ def test_what_it_has_learned_is_there_in_the_next_run(tmp_path: Path) -> None:
 def test_each_target_takes_its_seeds_and_some_more(name: str, tmp_path: Path) -> None:
     target = TARGETS[name]
     seeds = list(target.seeds())[:20]
-    tried = Fuzzer(target.try_, seeds, Corpus(tmp_path), watched=target.watched)
+    tried = Fuzzer(target.ready, seeds, Corpus(tmp_path), watched=target.watched)
     tried.run(runs=len(seeds) + 20)
     assert tried.lines > 20
     assert not list(tmp_path.glob("failure-*"))
