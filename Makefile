@@ -10,7 +10,7 @@ PACKAGES := sern_core sern_runtime sern_relay sern_client sern_sim sern_twin ser
 # quarter less of CPU, and each worker of the tests would rewrite all of them anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup lint format types test wheel compiled test-compiled explore standstills soak fuzz kills lab bench performance endpoints figures cellular navigation picture demo demo-twin demo-navigation schemas clean
+.PHONY: help setup lint format types test wheel compiled test-compiled explore standstills soak fuzz kills lab bench performance endpoints operations figures cellular navigation picture demo demo-twin demo-navigation schemas clean
 
 help:
 	@echo "make setup    create $(VENV) with pinned dependencies"
@@ -27,6 +27,7 @@ help:
 	@echo "make lab      the whole matrix of bad links, and the longer runs over tc netem, which need root"
 	@echo "make performance   as root: measure link, fleet and policies of docs/performance.md anew, two hours of an idle machine"
 	@echo "make endpoints, make figures   the other tables: ROS endpoints, 20 minutes; virtual time, summaries and codecs, 30"
+	@echo "make operations   the tables of keys and of durable topics, 10 minutes"
 	@echo "make cellular RECORDINGS=DIR   the table of recorded cellular links, a minute; virtual time"
 	@echo "make navigation   the tables of navigation and perception, hours; DRIVES=FILE keeps the drives, and goes on with them"
 	@echo "make picture  the demo, and its picture for README.md"
@@ -100,6 +101,7 @@ lab: setup
 soak: setup
 	mkdir -p build
 	$(BIN)/python -m benchmarks.soak --json build/soak.json
+	$(BIN)/python -m benchmarks.document build/soak.json
 
 fuzz: setup
 	$(BIN)/python -m tests.fuzz
@@ -128,6 +130,13 @@ endpoints: setup
 	$(BIN)/python -m benchmarks.endpoints --json build/endpoints.json
 	$(BIN)/python -m benchmarks.viewers --json build/viewers.json
 	$(BIN)/python -m benchmarks.document build/endpoints.json build/viewers.json
+
+# Of NATS too where its server is installed (Debian's nats-server).
+operations: setup
+	mkdir -p build
+	$(BIN)/python -m benchmarks.curve --json build/curve.json
+	$(BIN)/python -m benchmarks.durable --json build/durable.json
+	$(BIN)/python -m benchmarks.document build/curve.json build/durable.json
 
 # Neither root nor ROS is needed.
 figures: setup

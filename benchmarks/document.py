@@ -25,7 +25,7 @@ DOCUMENTS: Final = {
         ("link", "sensors", "robots", "relay", "footprint", "endpoints", "mmcf_lab", "thin_link", "cellular", "codecs"),
         DOCUMENT,
     ),
-    **dict.fromkeys(("navigation", "perception", "viewers"), DOCUMENT),
+    **dict.fromkeys(("navigation", "perception", "viewers", "curve", "durable", "soak"), DOCUMENT),
     **dict.fromkeys(("mmcf", "mmcf_replay", "mmcf_recovery"), THEORY),
     "summaries": ROOT / "docs" / "summaries.md",
     "matrix": ROOT / "docs" / "lab.md",

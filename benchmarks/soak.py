@@ -13,7 +13,6 @@ import sys
 import tempfile
 import urllib.request
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
@@ -27,6 +26,7 @@ from sern_tools.harness.processes import Child, Children, daemon
 from sern_tools.keygen import make_keys
 from sern_tools.ports import free_ports
 
+START_S: Final = 60.0
 SECONDS: Final = 600.0
 QUICK_SECONDS: Final = 60.0
 WARM_UP: Final = 0.2
@@ -94,6 +94,11 @@ class Soak:
             program = "relay" if name == "relay" else "client"
             command = daemon(program, self._folder / f"{name}.yaml")
             watched.append(Watched(await self._children.start(name, command, environment=environment())))
+
+        async def ready() -> bool:
+            return await asyncio.to_thread(lambda: all(_get(f"http://{listen}/readyz") for listen in self._https))
+
+        await self._children.until(ready, START_S, "the three that stay are not connected")
         return watched
 
     async def come_and_go(self) -> None:
@@ -127,14 +132,17 @@ class Soak:
         while True:
             for listen in self._https:
                 for path in PATHS:
-                    with suppress(OSError):
-                        await asyncio.to_thread(_get, f"http://{listen}{path}")
+                    await asyncio.to_thread(_get, f"http://{listen}{path}")
             await asyncio.sleep(2.0)
 
 
-def _get(address: str) -> int:
-    with urllib.request.urlopen(address, timeout=5.0) as answer:
-        return len(answer.read())
+def _get(address: str) -> bytes:
+    """The answer; empty while there is none."""
+    try:
+        with urllib.request.urlopen(address, timeout=5.0) as answer:
+            return bytes(answer.read())
+    except OSError:
+        return b""
 
 
 async def _soak(folder: Path, seconds: float) -> tuple[list[Watched], int]:
@@ -168,7 +176,13 @@ def bench(options: argparse.Namespace, report: common.Report) -> None:
     for who, each in zip(STAY, watched, strict=True):
         samples = each.after(WARM_UP * seconds)
         growth, files = slope_per_min(samples), files_more(samples)
-        report.row("soak", who, rss_MB=samples[-1][1], growth_MB_per_min=growth, files=samples[-1][2], more_files=files)
+        figures = {
+            "memory_MB": samples[-1][1],
+            "growth_MB/min": growth,
+            "open_files": samples[-1][2],
+            "more_files": files,
+        }
+        report.row("robots come and go", who, **figures)
         report.reach(f"{who}: growth of its memory, MB a minute", growth, GROWTH_LIMIT_MB_PER_MIN)
         report.reach(f"{who}: files more than at the start", files, FILES_LIMIT)
     report.note(
