@@ -131,9 +131,12 @@ class Bridge:
             self.services.stream_closed(stream)
         self.inbound.stream_closed(stream)
 
-    def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
-        if not self.inbound.message(stream, message, now=now) and self.services is not None:
+    def message(self, stream: StreamInfo, message: Message, *, now: float) -> DropReason | None:
+        if stream.id in self.inbound.streams:
+            return self.inbound.message(stream, message, now=now)
+        if self.services is not None:
             self.services.message(stream, message)
+        return None
 
     def expired(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
         self.inbound.expired(stream, seq, reason)

@@ -117,7 +117,7 @@ def _register_commands(metrics: Metrics, parts: Counting) -> None:
     metrics.counter(
         "sern_command_lease_expired_total",
         "Times a command topic went quiet and the stop command was published.",
-        read=lambda: [((), float(inbound.leases_fired))],
+        read=lambda: [((), float(inbound.commands.leases_fired))],
     )
     metrics.counter(
         "sern_command_guard_stops_total",

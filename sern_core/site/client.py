@@ -65,7 +65,8 @@ class ClientEvents(Protocol):
 
     def stream_closed(self, stream: StreamInfo) -> None: ...
 
-    def message(self, stream: StreamInfo, message: Message, *, now: float) -> None: ...
+    def message(self, stream: StreamInfo, message: Message, *, now: float) -> DropReason | None:
+        """A message of an open stream has its turn. Returns why it was not taken; None: it was."""
 
     def expired(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
         """A reliable message of a stream from elsewhere was dropped on its way; it is reported in its turn."""
@@ -447,11 +448,14 @@ class ClientCore:
             self._tell(self.events.expired, stream.stream, message.seq, reason)
             return
         try:
-            self.events.message(stream.stream, message, now=now)
+            refused = self.events.message(stream.stream, message, now=now)
         except Exception as error:  # noqa: BLE001  (of one message: the stream goes on, whatever its bodies do)
             self.fault(error)
             self._failed(stream, message, DropReason.FAULT, "", now)
         else:
+            if refused is not None:
+                self._failed(stream, message, refused, "", now)
+                return
             self.received.of(stream.stream).arrived(len(message.body), now - message.born_s, now)
             if self.trace.steps:
                 self.trace.record(
