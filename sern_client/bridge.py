@@ -15,7 +15,7 @@ from sern_client.site import Site
 from sern_core.link.handshake import DISPLACED
 from sern_core.site.client import ClientCore, ClientEvents
 from sern_core.site.services import parse as parse_service
-from sern_core.topics.rules import Discovery
+from sern_core.topics.rules import Discovery, RuleSet
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.key_news import RelayKeys
 from sern_core.vocabulary.message import Message, StreamInfo
@@ -72,6 +72,11 @@ class Bridge:
         self._said = SayOnce(_log)
         self.rejected_reason: str | None = None
         """Why the relay refuses us, in its words; None: it does not."""
+
+    def use(self, rules: RuleSet, discovery: Discovery) -> None:
+        """Have other rules in force, at once: nothing that they say the same of is touched."""
+        self.outbound.use(rules, discovery)
+        self.inbound.rules_changed()
 
     def close(self) -> None:
         """Before the endpoint is stopped: a robot that is being commanded is told to stand still."""

@@ -22,6 +22,7 @@ from sern_client.update_topics import UpdateTopics
 from sern_client.withdrawal import Kept, Withdrawable, Withdrawal
 from sern_core.site.client import ClientCore
 from sern_core.site.services import parse as parse_service
+from sern_core.topics.rules import ResolvedTopic
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.ledger import MAX_TOPICS, OTHER_TOPIC
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo
@@ -49,6 +50,7 @@ class Incoming:
         "local",
         "publish",
         "publisher",
+        "resolved",
         "rewrite",
         "withdrawn",
     )
@@ -56,6 +58,7 @@ class Incoming:
     def __init__(
         self,
         info: TopicInfo,
+        resolved: ResolvedTopic,
         publisher: Publisher | None,
         rewrite: Rewrite | None,
         *,
@@ -64,6 +67,7 @@ class Incoming:
     ) -> None:
         self.info = info
         self.local = info.name
+        self.resolved = resolved
         self.use(publisher)
         self.rewrite = rewrite
         self.commands = commands
@@ -157,7 +161,7 @@ class Inbound:
             if stop is None:
                 _log.error("%s is %s: on_link_loss cannot stop it; no lease", local, info.type_name)
         rewrite, kept = self._site.frames.incoming(info), self.withdrawal.kept(stream)
-        incoming = Incoming(info, publisher, rewrite, commands=stop is not None, kept=kept)
+        incoming = Incoming(info, resolved, publisher, rewrite, commands=stop is not None, kept=kept)
         self._streams[stream.id] = incoming
         if resolved.lease is not None and stop is not None:
             self.commands.opened(
@@ -187,6 +191,23 @@ class Inbound:
             if not self.commands.ended(stream.id):
                 self._close_publisher(incoming)
             _log.info("%s from %s has ended", stream.id.topic, stream.id.origin)
+
+    def rules_changed(self) -> None:
+        """The site has other rules: publish those streams anew for which they say something else here."""
+        rules, namespace = self._site.rules, self._site.namespace
+        changed = set()
+        for identity, incoming in self._streams.items():
+            local = rules.inward(identity.topic, namespace=namespace)
+            try:
+                resolved = rules.resolve(replace(incoming.info, name=local), local_name=local)
+            except ConfigError:
+                changed.add(identity)  # why is said when it is opened
+                continue
+            said, before = (resolved.lease, resolved.direction), (incoming.resolved.lease, incoming.resolved.direction)
+            if local != incoming.local or said != before:
+                changed.add(identity)
+        self._core.reopen(changed, now=clock.now())
+        self._reconsider()
 
     def _advertise(self, info: TopicInfo) -> Publisher:
         """ConfigError whatever goes wrong: the streams beside it must go on."""

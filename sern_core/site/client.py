@@ -224,6 +224,11 @@ class ClientCore:
         self._latched.pop(channel.stream.id, None)
         self.link.outgoing.close(channel, DropReason.SHUTDOWN, now=now)
 
+    def latched(self, channel: OutChannel) -> list[Message]:
+        """What late joiners of a latched topic would get, the oldest first."""
+        cache = self._latched.get(channel.stream.id)
+        return [] if cache is None else list(cache.replay())
+
     def send(
         self,
         channel: OutChannel,
@@ -399,6 +404,14 @@ class ClientCore:
         for stream in list(self.link.taking.incoming.values()):
             if stream.stream.id in self._refused and self._open_stream(stream):
                 self.link.answers.answer(stream, True, now=now)
+
+    def reopen(self, identities: Collection[StreamId], *, now: float) -> None:
+        """Close these streams from elsewhere for the shell, and open them anew: what holds for them here has changed.
+        The stream itself goes on."""
+        for stream in list(self.link.taking.incoming.values()):
+            if stream.stream.id in identities and stream.stream.id in self._open:
+                self._close_stream(stream, now)
+                self.link.answers.answer(stream, self._open_stream(stream), now=now)
 
     @property
     def refused(self) -> Collection[StreamId]:

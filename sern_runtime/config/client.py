@@ -63,6 +63,7 @@ from sern_runtime.config.shared import (
     DurableSection,
     HttpSection,
     LinkSection,
+    LocalSection,
     LogSection,
     SchedulerSection,
     output_problems,
@@ -517,6 +518,8 @@ class ClientFile(FileModel):
     """What this site's nodes are told of the link, and of who is there behind it."""
     http: HttpSection = HttpSection()
     """Metrics and health over HTTP; off by default."""
+    local: LocalSection = LocalSection()
+    """The socket for tools of this machine."""
     log: LogSection = LogSection()
     """The log."""
     message_log: PathText | None = None
