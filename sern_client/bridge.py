@@ -15,7 +15,7 @@ from sern_client.site import Site
 from sern_core.link.handshake import DISPLACED
 from sern_core.site.client import ClientCore, ClientEvents
 from sern_core.site.services import parse as parse_service
-from sern_core.topics.rules import Discovery
+from sern_core.topics.rules import Discovery, RuleSet
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.key_news import RelayKeys
 from sern_core.vocabulary.message import Message, StreamInfo
@@ -72,6 +72,11 @@ class Bridge:
         self._said = SayOnce(_log)
         self.rejected_reason: str | None = None
         """Why the relay refuses us, in its words; None: it does not."""
+
+    def use(self, rules: RuleSet, discovery: Discovery) -> None:
+        """Have other rules in force, at once: nothing that they say the same of is touched."""
+        self.outbound.use(rules, discovery)
+        self.inbound.rules_changed()
 
     def close(self) -> None:
         """Before the endpoint is stopped: a robot that is being commanded is told to stand still."""
@@ -131,9 +136,12 @@ class Bridge:
             self.services.stream_closed(stream)
         self.inbound.stream_closed(stream)
 
-    def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
-        if not self.inbound.message(stream, message, now=now) and self.services is not None:
+    def message(self, stream: StreamInfo, message: Message, *, now: float) -> DropReason | None:
+        if stream.id in self.inbound.streams:
+            return self.inbound.message(stream, message, now=now)
+        if self.services is not None:
             self.services.message(stream, message)
+        return None
 
     def expired(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
         self.inbound.expired(stream, seq, reason)

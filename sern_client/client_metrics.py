@@ -9,6 +9,7 @@ from sern_client.connection import Connection
 from sern_client.endpoints.base import CountingEndpoint, MeasuredEndpoint
 from sern_client.guard import Guard
 from sern_client.link_state import LinkState
+from sern_client.operating import Operating
 from sern_client.summaries.client_summaries import register_summaries
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.collector import CollectorWatch
@@ -34,6 +35,7 @@ class Counting:
     errors: InternalErrors
     collector: CollectorWatch
     scene: "SceneNode | None" = None
+    operating: Operating | None = None
 
 
 def register_client(metrics: Metrics, parts: Counting) -> None:
@@ -42,6 +44,7 @@ def register_client(metrics: Metrics, parts: Counting) -> None:
     _register_endpoint(metrics, parts)
     _register_commands(metrics, parts)
     _register_messages(metrics, parts)
+    _register_operating(metrics, parts.operating)
 
 
 def _register_link(metrics: Metrics, parts: Counting) -> None:
@@ -117,7 +120,7 @@ def _register_commands(metrics: Metrics, parts: Counting) -> None:
     metrics.counter(
         "sern_command_lease_expired_total",
         "Times a command topic went quiet and the stop command was published.",
-        read=lambda: [((), float(inbound.leases_fired))],
+        read=lambda: [((), float(inbound.commands.leases_fired))],
     )
     metrics.counter(
         "sern_command_guard_stops_total",
@@ -170,4 +173,28 @@ def _register_messages(metrics: Metrics, parts: Counting) -> None:
         "sern_bad_frames_total",
         "Frames from the relay that were not valid.",
         read=lambda: [((), float(parts.connection.bad_frames))],
+    )
+
+
+def _register_operating(metrics: Metrics, operating: Operating | None) -> None:
+    """What was changed while it runs; a client without this part counts nothing."""
+    metrics.gauge(
+        "sern_client_reload_failed",
+        "1 while what the last reload read is not in force.",
+        read=lambda: [((), float(operating is not None and operating.reloads.failing))],
+    )
+    metrics.counter(
+        "sern_client_reload_failures_total",
+        "Reloads that kept the old configuration.",
+        read=lambda: [((), float(0 if operating is None else operating.reloads.failures))],
+    )
+    metrics.gauge(
+        "sern_client_set_by_hand",
+        "Topics of which something is set by hand (sern set).",
+        read=lambda: [((), float(0 if operating is None else len(operating.settings.by_topic)))],
+    )
+    metrics.counter(
+        "sern_client_local_refused_total",
+        "Connections and requests on the local socket that were refused.",
+        read=lambda: [((), float(0 if operating is None else operating.refused))],
     )

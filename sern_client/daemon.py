@@ -36,6 +36,7 @@ from sern_client.keyring import ClientKeyring, KeyFiles
 from sern_client.link_news import SILENT, LinkNews
 from sern_client.link_state import LinkState
 from sern_client.on_demand import OnDemand
+from sern_client.operating import Operating
 from sern_client.scene.making import make_scene
 from sern_client.services import ServiceBridge
 from sern_client.site import Site
@@ -149,6 +150,15 @@ class ClientDaemon:
         self.scene = make_scene(loaded, endpoint, self.site, objects, local_encoding(model))
         self.on_demand = self._make_on_demand(endpoint, objects)
         self.adaptation = self._make_adaptation()
+        self.operating = Operating(
+            loaded,
+            self.bridge,
+            self.adaptation,
+            self.events,
+            self.notifier,
+            status=self._status,
+            reload_keys=self._reload_keys,
+        )
         self.news = LinkNews(self.core.link, model.relay.endpoint, self.events)
         self.link_state = LinkState(
             self.core,
@@ -161,7 +171,14 @@ class ClientDaemon:
             events=self.events,
         )
         self.views = ClientViews(
-            model.name, self.bridge, self.news, self.link_state, self.events, reason=self.why, address=self._address
+            model.name,
+            self.bridge,
+            self.news,
+            self.link_state,
+            self.events,
+            reason=self.why,
+            address=self._address,
+            by_hand=self.operating.to_json,
         )
         if isinstance(endpoint, ShowingEndpoint):
             endpoint.show_link(self.link_words)
@@ -229,7 +246,10 @@ class ClientDaemon:
             self.keyring.refused()
 
     def reload(self) -> None:
-        """SIGHUP: read the keys anew."""
+        """SIGHUP: read the file and the keys anew."""
+        self.operating.reload()
+
+    def _reload_keys(self) -> None:
         if self.keyring is not None:
             self.keyring.reload()
 
@@ -320,6 +340,7 @@ class ClientDaemon:
         if self.adaptation is not None:
             kept = self.parts.keep("adaptation", self.adaptation.run, reset=self.adaptation.reset)
             self.tasks.append(asyncio.create_task(kept, name="adaptation"))
+        await self.operating.start()
         self.notifier.ready(f"{model.name} -> {relay.endpoint}")
         words = "client %s started, relay %s"
         self.events.say(_log, logging.INFO, "started", "", words, model.name, relay.endpoint)
@@ -375,9 +396,13 @@ class ClientDaemon:
                 watchdog.check()
             self.news.look()
             self.events.tick()
-            link = self.core.link
-            state = "up" if link.established and not link.lane.stalled else f"down: {self.why()}"
-            self.notifier.status(f"link {state}")
+            self.notifier.status(self._status())
+
+    def _status(self) -> str:
+        """One line for systemd."""
+        link = self.core.link
+        state = "up" if link.established and not link.lane.stalled else f"down: {self.why()}"
+        return self.operating.reloads.beside(f"link {state}")
 
     async def _tell_objects(self) -> None:
         while True:
@@ -434,6 +459,7 @@ class ClientDaemon:
             errors=self.errors,
             collector=self.collector,
             scene=self.scene,
+            operating=self.operating,
         )
         register_client(metrics, counting)
         metrics.counter(
@@ -536,6 +562,7 @@ class ClientDaemon:
                 stack.push_async_callback(self.keyring.close)
             stack.callback(self.codecs.close)
             stack.push_async_callback(end_tasks, self.tasks)
+            stack.push_async_callback(self.operating.stop)
 
     def _write_summary(self) -> None:
         name = self.loaded.model.summary

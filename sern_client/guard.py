@@ -19,6 +19,7 @@ from typing import Final, Self
 
 from sern_client.endpoints.base import GUARD_SUFFIX
 from sern_client.factory import named_sections
+from sern_core.topics.rules import Ramp
 from sern_core.vocabulary.message import TopicInfo
 from sern_runtime import clock
 from sern_runtime.config import endpoints as sections
@@ -49,7 +50,11 @@ _log = logging.getLogger(__name__)
 class _Topic:
     info: TopicInfo
     stop: bytes
+    ramp: Ramp | None
     due_s: float | None = None
+    command: bytes | None = None  # the last one, where it can be slowed down
+    said_s: float = 0.0
+    since_s: float | None = None
 
 
 class Guard:
@@ -103,17 +108,26 @@ class Guard:
 
     # --- leases -----------------------------------------------------------------------------------------------------
 
-    def opened(self, info: TopicInfo, stop: bytes) -> int:
-        """A command topic with a lease; returns what it is called in `lease` and `closed`."""
+    def opened(self, info: TopicInfo, stop: bytes, ramp: Ramp | None = None) -> int:
+        """A command topic with a lease; returns what it is called in the calls below."""
         key, self._next_key = self._next_key, self._next_key + 1
-        topic = self._topics[key] = _Topic(info, stop)
+        topic = self._topics[key] = _Topic(info, stop, ramp)
         self._say(_opening(key, topic))
         return key
 
-    def lease(self, key: int, due_s: float | None) -> None:
-        """When the lease of a topic runs out now. Call it before a command is published, and after a stop command."""
-        self._topics[key].due_s = due_s
-        self._say({"lease": key, "due": due_s})
+    def commanded(self, key: int, due_s: float | None, command: bytes | None) -> None:
+        """When the lease of a topic runs out now that a command comes. Call it before that is published. `command`: its
+        body, where it can be slowed down."""
+        topic = self._topics[key]
+        topic.due_s, topic.command, topic.said_s, topic.since_s = due_s, command, clock.now(), None
+        self._say(_commanded(key, topic) if topic.ramp is not None else {"lease": key, "due": due_s})
+
+    def lease(self, key: int, due_s: float | None, *, since_s: float | None = None) -> None:
+        """When the lease of a topic is due next. Call it after what was due is published. `since_s`: the robot is being
+        slowed down since then."""
+        topic = self._topics[key]
+        topic.due_s, topic.since_s = due_s, since_s
+        self._say(_leased(key, topic))
 
     def closed(self, key: int) -> None:
         del self._topics[key]
@@ -163,7 +177,9 @@ class Guard:
         for key, topic in self._topics.items():
             self._say(_opening(key, topic))
             if topic.due_s is not None:
-                self._say({"lease": key, "due": topic.due_s})
+                if topic.ramp is not None:
+                    self._say(_commanded(key, topic))
+                self._say(_leased(key, topic))
         self._unanswered = 0
         silence = asyncio.create_task(self._listen_for_silence(process), name="guard-silence")
         try:
@@ -247,7 +263,22 @@ def _services_only(section: DrivesRobots) -> bool:
 
 
 def _opening(key: int, topic: _Topic) -> dict[str, object]:
-    return {"open": key, "info": asdict(topic.info), "stop": base64.b64encode(topic.stop).decode()}
+    said: dict[str, object] = {
+        "open": key,
+        "info": asdict(topic.info),
+        "stop": base64.b64encode(topic.stop).decode(),
+    }
+    return said if topic.ramp is None else {**said, "ramp": asdict(topic.ramp)}
+
+
+def _commanded(key: int, topic: _Topic) -> dict[str, object]:
+    command = None if topic.command is None else base64.b64encode(topic.command).decode()
+    return {"lease": key, "due": topic.due_s, "command": command, "said": topic.said_s}
+
+
+def _leased(key: int, topic: _Topic) -> dict[str, object]:
+    said: dict[str, object] = {"lease": key, "due": topic.due_s}
+    return said if topic.since_s is None else {**said, "since": topic.since_s}
 
 
 async def _spawn(*command: str) -> Process:

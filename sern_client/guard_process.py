@@ -7,8 +7,11 @@ the command topics that are connected before they are needed. `sern_client/guard
 What the client says, a line of JSON each, on standard input:
 
     {"endpoints": [...], "folder": "...", "log": {...}}              first: what to join
-    {"open": 1, "info": {...}, "stop": "base64"}                     a command topic with a lease, and its stop command
+    {"open": 1, "info": {...}, "stop": "base64", "ramp": {...}}      a command topic with a lease, its stop command, and
+                                                                     how its robot is slowed down, if it is
     {"lease": 1, "due": 1234.5}                                      its deadline (sern_runtime.clock), null: not armed
+    {"lease": 1, "due": 1234.5, "command": "base64", "said": 1234.0} the same, for this command; null: it has no ramp
+    {"lease": 1, "due": 1234.5, "since": 1234.4}                     the same, while the robot is being slowed down
     {"close": 1}                                                     the client has said what there was to say
     {"ping": 7}
 
@@ -38,7 +41,9 @@ from sern_client.endpoints.base import Endpoint, Publisher
 from sern_client.endpoints.composite import CompositeEndpoint
 from sern_client.endpoints.conversion import Converter
 from sern_client.sections import make_section
+from sern_core.bodies.twist import TwistBody
 from sern_core.site.lease import GuardLease
+from sern_core.topics.rules import Ramp
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding, TopicName
@@ -68,6 +73,7 @@ class _Guarded:
 
     name: TopicName
     publisher: Publisher | None
+    info: TopicInfo
     stop: bytes
     lease: GuardLease
 
@@ -139,9 +145,13 @@ class GuardProcess:
 
     def _told(self, said: dict[str, Any]) -> None:
         if "lease" in said:
-            self._topics[said["lease"]].lease.told(said["due"])
+            topic = self._topics[said["lease"]]
+            if "command" in said:
+                topic.lease.commanded(_command(topic.info, said["command"]), said_s=said["said"])
+            topic.lease.told(said["due"], since_s=said.get("since"))
         elif "open" in said:
-            self._open(said["open"], _info(said["info"]), base64.b64decode(said["stop"]))
+            ramp = Ramp(**said["ramp"]) if "ramp" in said else None
+            self._open(said["open"], _info(said["info"]), base64.b64decode(said["stop"]), ramp)
         elif "close" in said:
             topic = self._topics.pop(said["close"])
             if topic.publisher is not None:
@@ -149,13 +159,13 @@ class GuardProcess:
         elif "ping" in said:
             self.say({"pong": said["ping"]})
 
-    def _open(self, key: int, info: TopicInfo, stop: bytes) -> None:
+    def _open(self, key: int, info: TopicInfo, stop: bytes, ramp: Ramp | None) -> None:
         publisher = None
         try:
             publisher = Converter().advertise(self._endpoint, info)
         except ConfigError as error:
             _log.error("%s: the guard cannot publish its stop command: %s", info.name, error)
-        self._topics[key] = _Guarded(info.name, publisher, stop, GuardLease())
+        self._topics[key] = _Guarded(info.name, publisher, info, stop, GuardLease(ramp))
 
     def _due(self) -> None:
         self._read()  # the last word of the client, if there is one, comes first
@@ -164,18 +174,20 @@ class GuardProcess:
             first = not topic.lease.expired
             if not topic.lease.due(now=now):
                 continue
-            self._publish(topic)
+            slowed = topic.lease.slowed(now=now)
+            self._publish(topic, topic.stop if slowed is None else slowed)
             if first:
                 why = "the client has ended" if self._gone else "the client does not answer"
-                _log.warning("%s: %s; publishing the stop command", topic.name, why)
+                what = "publishing the stop command" if slowed is None else "slowing the robot down"
+                _log.warning("%s: %s; %s", topic.name, why, what)
                 self.say({"stopped": key})
         self._arm()
 
-    def _publish(self, topic: _Guarded) -> None:
+    def _publish(self, topic: _Guarded, body: bytes) -> None:
         if topic.publisher is None:
             return
         try:
-            topic.publisher.publish(topic.stop, time.time_ns())
+            topic.publisher.publish(body, time.time_ns())
         except Exception:  # noqa: BLE001  (a fault of one topic; the others are to be stopped all the same)
             _log.exception("%s: the stop command could not be published", topic.name)
 
@@ -184,6 +196,10 @@ class GuardProcess:
         self._timer.arm(min(deadlines_s) if deadlines_s else None)
         if self._gone and not deadlines_s:
             self.over.set()
+
+
+def _command(info: TopicInfo, said: str | None) -> TwistBody | None:
+    return None if said is None else TwistBody.read(info.type_name, info.encoding, base64.b64decode(said))
 
 
 def _info(said: dict[str, Any]) -> TopicInfo:

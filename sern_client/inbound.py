@@ -1,4 +1,4 @@
-"""Publishes streams from elsewhere at the endpoint: names, leases and stop commands, rebuilt grids, what is kept."""
+"""Publishes streams from elsewhere at the endpoint: names, rebuilt grids, what is kept. Commands: commands.py."""
 
 import logging
 import time
@@ -10,6 +10,7 @@ from math import inf
 from typing import Final
 
 from sern_client.actions import GoalWatch
+from sern_client.commands import Commands
 from sern_client.endpoints.base import Difference, Publisher, keepers_of, publisher_within, teller_of_age
 from sern_client.frames import Rewrite
 from sern_client.guard import Guard
@@ -20,14 +21,13 @@ from sern_client.subscribed import Subscribed
 from sern_client.update_topics import UpdateTopics
 from sern_client.withdrawal import Kept, Withdrawable, Withdrawal
 from sern_core.site.client import ClientCore
-from sern_core.site.lease import CommandLease
 from sern_core.site.services import parse as parse_service
+from sern_core.topics.rules import ResolvedTopic
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.ledger import MAX_TOPICS, OTHER_TOPIC
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo
 from sern_core.vocabulary.types import ClientName, DropReason, TopicName
 from sern_runtime import clock, ros_types
-from sern_runtime.fine_timer import fine_timer
 from sern_runtime.link_metrics import AgeHistograms
 from sern_runtime.loop import Timer
 
@@ -39,41 +39,38 @@ _log = logging.getLogger(__name__)
 
 
 class Incoming:
-    """A stream from elsewhere that is published here, as `info`. `stop` is the body that a lost link makes us publish.
-    `publisher` None: it is of use to another stream only. `guarded`: what the guard calls it; None: it has none."""
+    """A stream from elsewhere that is published here, as `info`. `publisher` None: it is of use to another stream only.
+    `commands`: it has a lease."""
 
     __slots__ = (
         "aged",
-        "guarded",
+        "commands",
         "info",
         "kept",
-        "lease",
         "local",
         "publish",
         "publisher",
+        "resolved",
         "rewrite",
-        "stop",
         "withdrawn",
     )
 
     def __init__(
         self,
         info: TopicInfo,
+        resolved: ResolvedTopic,
         publisher: Publisher | None,
-        lease: CommandLease | None,
-        stop: bytes | None,
         rewrite: Rewrite | None,
         *,
-        guarded: int | None,
+        commands: bool,
         kept: Kept | None,
     ) -> None:
         self.info = info
         self.local = info.name
+        self.resolved = resolved
         self.use(publisher)
-        self.lease = lease
-        self.stop = stop
         self.rewrite = rewrite
-        self.guarded = guarded
+        self.commands = commands
         self.kept = kept
         self.withdrawn: ClientName | None = None
 
@@ -103,18 +100,17 @@ class Inbound:
         self.subscription_problems: dict[str, str] = {}
         """What the relay does not let us have, in its words, with the code."""
         self.deadlines_missed: dict[TopicName, int] = {}
-        self.leases_fired = 0
         self.publish_failures = 0
+        self.commands = Commands(site, core, guard)
+        """Those that are published here, and what is said when they stay away."""
         self._site = site
         self._core = core
-        self._guard = guard
         self._goals = goals
         self._closed = False
         self._streams: dict[StreamId, Incoming] = {}
         self.withdrawal = Withdrawal(self._streams, self._advertise, self._close_publisher, used=withdraws)
         """Ends the topics of who is not there."""
         self._last_arrival_s: dict[StreamId, float] = {}
-        self._timer = fine_timer(self._leases_due)  # one that is due while the machine sleeps is due when it wakes
         self._unreceived: dict[StreamId, str] = {}  # streams that could not be published here, and why
         self._again = Timer(self._reconsider)
         self._again_s = AGAIN_S[0]
@@ -130,21 +126,16 @@ class Inbound:
         """Every stream that is taken here."""
         return self._streams.keys()
 
-    @property
-    def lease_due_s(self) -> float | None:
-        """When the next stop command is published unless a command comes; None: no lease runs."""
-        return self._timer.deadline_s
-
     def close(self) -> None:
         """Before the endpoint is stopped: a robot that is being commanded is told to stand still."""
         self._closed = True
-        self._timer.close()
         self._keep_timer.cancel()
         self._again.cancel()
         self.rebuilds.close()
         self._updates.close()
+        self.commands.close()
         for incoming in self._streams.values():
-            self._release(incoming)
+            self._close_publisher(incoming)
         self._streams.clear()
 
     # --- streams begin and end --------------------------------------------------------------------------------------
@@ -164,18 +155,19 @@ class Inbound:
             self._not_received(stream, str(error))
             raise
         self._unreceived.pop(stream.id, None)
-        lease = stop = guarded = None
+        stop = None
         if resolved.lease is not None:
             stop = ros_types.zero_message(info.type_name, info.encoding)
             if stop is None:
                 _log.error("%s is %s: on_link_loss cannot stop it; no lease", local, info.type_name)
-            else:
-                lease = CommandLease(resolved.lease.after_s)
         rewrite, kept = self._site.frames.incoming(info), self.withdrawal.kept(stream)
-        if self._guard is not None and stop is not None:
-            guarded = self._guard.opened(info, stop)
-        incoming = Incoming(info, publisher, lease, stop, rewrite, guarded=guarded, kept=kept)
+        incoming = Incoming(info, resolved, publisher, rewrite, commands=stop is not None, kept=kept)
         self._streams[stream.id] = incoming
+        if resolved.lease is not None and stop is not None:
+            self.commands.opened(
+                stream.id, info, resolved.lease, stop,
+                publish=partial(self._publish, incoming), close=partial(self._close_publisher, incoming),
+            )  # fmt: skip
         if self._goals is not None:
             self._goals.opened(info, lambda body: self._publish(incoming, body, time.time_ns()))
         updates = self.rebuilds.opened(stream, lambda body, stamp_ns: self._show(incoming, body, stamp_ns))
@@ -196,8 +188,26 @@ class Inbound:
         if incoming is not None:
             if self._goals is not None:
                 self._goals.ended(incoming.local)
-            self._release(incoming)
+            if not self.commands.ended(stream.id):
+                self._close_publisher(incoming)
             _log.info("%s from %s has ended", stream.id.topic, stream.id.origin)
+
+    def rules_changed(self) -> None:
+        """The site has other rules: publish those streams anew for which they say something else here."""
+        rules, namespace = self._site.rules, self._site.namespace
+        changed = set()
+        for identity, incoming in self._streams.items():
+            local = rules.inward(identity.topic, namespace=namespace)
+            try:
+                resolved = rules.resolve(replace(incoming.info, name=local), local_name=local)
+            except ConfigError:
+                changed.add(identity)  # why is said when it is opened
+                continue
+            said, before = (resolved.lease, resolved.direction), (incoming.resolved.lease, incoming.resolved.direction)
+            if local != incoming.local or said != before:
+                changed.add(identity)
+        self._core.reopen(changed, now=clock.now())
+        self._reconsider()
 
     def _advertise(self, info: TopicInfo) -> Publisher:
         """ConfigError whatever goes wrong: the streams beside it must go on."""
@@ -234,14 +244,6 @@ class Inbound:
         self._core.subscribe(patterns, now=clock.now())
         self._site.kick()
 
-    def _release(self, incoming: Incoming) -> None:
-        """No more commands will come from there: the last one must not stand."""
-        if incoming.lease is not None and incoming.stop is not None and incoming.lease.deadline() is not None:
-            self._publish(incoming, incoming.stop, time.time_ns())
-        if self._guard is not None and incoming.guarded is not None:
-            self._guard.closed(incoming.guarded)
-        self._close_publisher(incoming)
-
     def _close_publisher(self, incoming: Withdrawable) -> None:
         if incoming.publisher is not None:
             try:
@@ -252,17 +254,17 @@ class Inbound:
 
     # --- messages ---------------------------------------------------------------------------------------------------
 
-    def message(self, stream: StreamInfo, message: Message, *, now: float) -> bool:
-        """A message has its turn. False: its stream is not published here."""
-        incoming = self._streams.get(stream.id)
-        if incoming is None:
-            return False
+    def message(self, stream: StreamInfo, message: Message, *, now: float) -> DropReason | None:
+        """A message of one of our `streams` has its turn. Returns why it is not published; None: it was."""
+        incoming = self._streams[stream.id]
+        if incoming.commands:
+            refused = self.commands.refuses(stream.id, born_s=message.born_s, now=now)
+            if refused is not None:
+                return refused
         self._site.values.passed(stream, message.seq, message.body)
         age_s = now - message.born_s
-        if incoming.lease is not None:
-            incoming.lease.renew(born_s=message.born_s)
-            self._arm()
-            self._tell_guard(incoming)  # before it is published: no stop command of before may come after it
+        if incoming.commands:
+            self.commands.renew(stream.id, self._local(incoming, message.body), born_s=message.born_s, now=now)
         mark = self.keeping.mark() if stream.spec.reliable and self.keeping else None
         if not self.rebuilds.message(stream, message, owed=mark is not None):
             lifespan_s = stream.spec.lifespan_s
@@ -289,18 +291,24 @@ class Inbound:
                 self._site.log.delivered(stream, message, age_s)
         except Exception as error:  # noqa: BLE001  (of the log alone)
             self._site.parts.failed("message_log", error)
-        return True
+        return None
 
     def _show(self, incoming: Incoming, body: bytes, stamp_ns: int, left_s: float = inf) -> None:
         """Publish what came, or was put together here."""
-        if incoming.rewrite is not None:
-            try:
-                body = incoming.rewrite(body)
-            except Exception as error:  # noqa: BLE001  (as it came is better than not at all)
-                self._site.parts.failed("frames", error)
+        body = self._local(incoming, body)
         self._publish(incoming, body, stamp_ns, left_s)
         if incoming.kept is not None:
             incoming.kept.append((body, stamp_ns))
+
+    def _local(self, incoming: Incoming, body: bytes) -> bytes:
+        """What came, with the frame ids of this site."""
+        if incoming.rewrite is None:
+            return body
+        try:
+            return incoming.rewrite(body)
+        except Exception as error:  # noqa: BLE001  (as it came is better than not at all)
+            self._site.parts.failed("frames", error)
+            return body
 
     def _publish(self, incoming: Incoming, body: bytes, stamp_ns: int, left_s: float = inf) -> None:
         """`left_s`: how much longer the message is young enough."""
@@ -373,7 +381,9 @@ class Inbound:
     @property
     def held(self) -> Counter[TopicName]:
         """Our publishers at the endpoint, by local name."""
-        return Counter(incoming.local for incoming in self._streams.values() if incoming.publisher is not None)
+        held = Counter(incoming.local for incoming in self._streams.values() if incoming.publisher is not None)
+        held.update(self.commands.ending)
+        return held
 
     def validate(self) -> list[Difference]:
         """Compare our table with the core's: what is not as it should be."""
@@ -395,36 +405,3 @@ class Inbound:
                         incoming.use(self._advertise(incoming.info))
                     except ConfigError as error:
                         _log.error("%s cannot be published again: %s", name, error)
-
-    # --- leases -----------------------------------------------------------------------------------------------------
-
-    def _arm(self) -> None:
-        deadlines = [
-            deadline_s
-            for incoming in self._streams.values()
-            if incoming.lease is not None and (deadline_s := incoming.lease.deadline()) is not None
-        ]
-        self._timer.arm(min(deadlines) if deadlines else None)
-
-    def _tell_guard(self, incoming: Incoming) -> None:
-        if self._guard is not None and incoming.guarded is not None and incoming.lease is not None:
-            self._guard.lease(incoming.guarded, incoming.lease.deadline())
-
-    def _leases_due(self) -> None:
-        now = clock.now()
-        for stream, incoming in self._streams.items():
-            lease = incoming.lease
-            if lease is None or incoming.stop is None:
-                continue
-            first = not lease.expired
-            if lease.due(now=now):
-                self._publish(incoming, incoming.stop, time.time_ns())
-                self._tell_guard(incoming)
-                if first:
-                    self.leases_fired += 1
-                    self._core.lease_expired(stream, lease.after_s, now=now)
-                    self._site.events.say(
-                        _log, logging.WARNING, "command_stopped", incoming.local,
-                        "%s: no fresh command; publishing the stop command", incoming.local, after_s=lease.after_s,
-                    )  # fmt: skip
-        self._arm()

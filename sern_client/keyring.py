@@ -110,7 +110,7 @@ class ClientKeyring:
             return
         if self.keys != before or self.server_keys != server_before:
             self._use(self.keys != before)
-        _log.info("reloaded keys; other changes need a restart")
+        _log.info("reloaded keys")
         self._answer()
 
     def refused(self) -> None:

@@ -2,13 +2,14 @@
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Collection, KeysView
+from collections.abc import Callable, Collection, KeysView, Mapping
 from dataclasses import replace
 from typing import Final
 
 from sern_client.actions import GoalWatch
 from sern_client.durable import DurableTopics
 from sern_client.endpoints.base import Difference, Sink, Subscription
+from sern_client.entry import Entry
 from sern_client.frames import Rewrite
 from sern_client.leaving import Leaving
 from sern_client.site import CAPPED, Site
@@ -20,39 +21,60 @@ from sern_client.tf_merge import LatchedTransforms, MergedTransforms
 from sern_core.site.client import ClientCore
 from sern_core.stream.out_channel import OutChannel
 from sern_core.summaries.transforms import is_static
-from sern_core.topics.rules import Discovery, ResolvedTopic
+from sern_core.topics.rules import Discovery, ResolvedTopic, RuleSet
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.ledger import MAX_TOPICS
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo
 from sern_core.vocabulary.names import to_global
 from sern_core.vocabulary.types import CLASS_LABELS, DropReason, Encoding, TopicName
 from sern_runtime import clock
+from sern_runtime.loop import Timer
 
+CHANGING_S: Final = 0.02
+"""How often a reliable topic is looked at that is to be offered otherwise once all is delivered."""
 CLOSED: Final = "it is offered to nobody: its channel is closed"
 
 _log = logging.getLogger(__name__)
 
 
 class Outgoing:
-    """A local topic that is offered to the link; `source` makes something else of it before. Its messages go to
-    `sink`."""
+    """A local topic that is offered to the link, as `resolved` says; `source` makes something else of it before. Its
+    messages go to `entry`."""
 
-    __slots__ = ("channel", "name", "sink", "source", "subscription")
+    __slots__ = ("channel", "entry", "info", "name", "resolved", "source", "subscription")
 
     def __init__(
-        self, name: TopicName, channel: OutChannel, subscription: Subscription, source: Source | None, sink: Sink
+        self,
+        info: TopicInfo,
+        resolved: ResolvedTopic,
+        channel: OutChannel,
+        source: Source | None,
+        entry: Entry,
+        subscription: Subscription,
     ) -> None:
-        self.name = name
+        self.info = info
+        self.name = info.name
+        self.resolved = resolved
         self.channel = channel
-        self.sink = sink
-        self.subscription = subscription
         self.source = source
+        self.entry = entry
+        self.subscription = subscription
 
     @property
     def streams(self) -> set[StreamId]:
         """All that its messages go to, in whatever form."""
         own = {self.channel.stream.id}
         return own if self.source is None else own | self.source.streams
+
+
+def _essence(resolved: ResolvedTopic) -> ResolvedTopic:
+    """What the rules say of a topic that leaves here, wherever the rule stands among the others."""
+    return replace(resolved, rule=None, lease=None)
+
+
+def _without_birth(send: Callable[[bytes, int, float | None], bool]) -> Sink:
+    """What takes messages that are born as they come."""
+    return lambda body, stamp_ns: send(body, stamp_ns, None)
 
 
 class Outbound:
@@ -86,7 +108,10 @@ class Outbound:
         """What says of durable topics how much of them is on disk."""
         self._stopped = False
         self._closed = False
+        self._known: dict[TopicName, TopicInfo] = {}  # at the endpoint, offered or not
         self._topics: dict[TopicName, Outgoing] = {}
+        self._changing: dict[TopicName, ResolvedTopic] = {}  # reliable ones that are to be offered otherwise
+        self._change_timer = Timer(self._look_at_changing)
         self._by_stream: dict[StreamId, Outgoing] = {}  # the same, by each stream it goes to
         self.unnamed: dict[TopicName, None] = {}
         """Local topics that stay here because no rule names them, as far as that was said."""
@@ -117,6 +142,8 @@ class Outbound:
                 outgoing.source.close()
                 for channel in outgoing.source.own:
                     self._unpublish(channel)
+        self._change_timer.cancel()
+        self._changing.clear()
         self.summaries.close()
         self.stored.close_all()
         self._topics.clear()
@@ -126,53 +153,155 @@ class Outbound:
     # --- TopicEvents: from the endpoint -----------------------------------------------------------------------------
 
     def topic_added(self, info: TopicInfo) -> None:
+        self._known[info.name] = info
         if info.name in self._topics or self._stopped:
             return
         self.leaving.come_back(info.name)
+        resolved = self._wanted(info)
+        if resolved is None:
+            return
+        opened = self._open(info, resolved)
+        if opened is None:
+            return
+        channel, source, entry = opened
+        try:
+            subscription = self._site.endpoint.subscribe(info.name, entry.take)
+        except UsageError as error:
+            _log.error("%s cannot be taken: %s", info.name, error)
+            self._withdraw(channel, source)
+            return
+        outgoing = self._topics[info.name] = Outgoing(info, resolved, channel, source, entry, subscription)
+        self._offered(outgoing)
+
+    def _offered(self, outgoing: Outgoing) -> None:
+        self._by_stream.update(dict.fromkeys(outgoing.streams, outgoing))
+        channel = outgoing.channel
+        _log.info(
+            "offering %s (%s) as %s: class %s, %s", outgoing.name, outgoing.info.type_name, channel.stream.id.topic,
+            CLASS_LABELS[channel.spec.priority], "reliable" if channel.spec.reliable else "best effort",
+        )  # fmt: skip
+        self._site.kick()
+
+    def _wanted(self, info: TopicInfo) -> ResolvedTopic | None:
+        """What the rules make of a topic at the endpoint; None: it is not offered."""
         rules = self._site.rules
         listed = rules.find(info.type_name, info.name) is not None
         if not self._discovery.wants(info.name, info.type_name, listed=listed):
             if self._discovery.wants(info.name, info.type_name, listed=True):  # only a rule is missing
                 self._say_unnamed(info)
-            return
+            return None
         try:
             resolved = rules.resolve(info, local_name=info.name)
         except ConfigError as error:
             _log.error("%s", error)
-            return
-        if not resolved.direction.sends:
-            return
+            return None
+        return resolved if resolved.direction.sends else None
+
+    def _open(self, info: TopicInfo, resolved: ResolvedTopic) -> tuple[OutChannel, Source | None, Entry] | None:
+        """Offer a topic to the link; None: it cannot be, which has been said."""
         name = to_global(resolved.name, self._site.namespace)
         try:
             channel, source = self._offer(info, resolved, name)
         except UsageError as error:
             _log.error("%s cannot be offered as %s: %s", info.name, name, error)
-            return
+            return None
+        rewrite = self._site.frames.outgoing(info)
+        send = None
         if self._durable is not None and resolved.spec.durable:
-            sink = self._kept(info, channel, self._durable)
+            plain = sink = self._kept(info, channel, self._durable)
+        elif source is None:
+            send = self._send(channel, rewrite)
+            plain = sink = _without_birth(send)
         else:
-            sink = self._sink(channel, self._site.frames.outgoing(info)) if source is None else source.sink
+            plain = sink = source.sink
         if resolved.dead_reckoning and source is None and info.encoding is not Encoding.RAW:
             sink = self._reckoned(info, sink)
         if self._goals is not None:
             sink = self._goals.outgoing(info, channel, sink)
-        try:
-            subscription = self._site.endpoint.subscribe(info.name, sink)
-        except UsageError as error:
-            _log.error("%s cannot be taken: %s", info.name, error)
-            self._withdraw(channel, source)
+        return channel, source, Entry(sink, channel, send if sink is plain else None)
+
+    # --- other rules ------------------------------------------------------------------------------------------------
+
+    @property
+    def known(self) -> Mapping[TopicName, TopicInfo]:
+        """The topics of the endpoint, offered or not, by local name."""
+        return self._known
+
+    @property
+    def changing(self) -> KeysView[TopicName]:
+        """Reliable topics that are offered as before until what they owe is delivered."""
+        return self._changing.keys()
+
+    def use(self, rules: RuleSet, discovery: Discovery) -> None:
+        """Have other rules in force, at once. Topics for which they say the same are not touched.
+
+        A reliable topic goes on as before until all that it owes is delivered, and what comes meanwhile waits here: no
+        message of it is lost, unless more waits than its queue may hold, which is refused to its publisher. A topic
+        that is kept on disk stays as it is until the next start."""
+        self._site.rules, self._discovery = rules, discovery
+        self.unnamed.clear()
+        for info in [] if self._stopped else list(self._known.values()):
+            outgoing = self._topics.get(info.name)
+            if outgoing is None:
+                self.topic_added(info)
+                continue
+            wanted = self._wanted(info)
+            if wanted is None:
+                self._remove(info.name)
+            elif _essence(wanted) == _essence(outgoing.resolved):
+                self._changing.pop(info.name, None)
+                outgoing.resolved = wanted
+                outgoing.entry.open()
+            elif self._durable is not None and (wanted.spec.durable or outgoing.channel.spec.durable):
+                _log.warning("%s is kept on disk: what the new rules say of it holds from the next start on", info.name)
+            else:
+                self._changing[info.name] = wanted
+        self._look_at_changing()
+
+    def _look_at_changing(self) -> None:
+        for name, wanted in list(self._changing.items()):
+            outgoing = self._topics[name]
+            if outgoing.channel.retained:
+                outgoing.entry.hold(outgoing.channel.spec.max_queue_bytes)
+                continue
+            del self._changing[name]
+            self._change(outgoing, wanted)
+        if self._changing:
+            self._change_timer.arm(clock.now() + CHANGING_S)
+
+    def _change(self, outgoing: Outgoing, wanted: ResolvedTopic) -> None:
+        """Offer a topic otherwise, with the subscription that it has."""
+        waiting, latched = outgoing.entry.take_waiting(), self._core.latched(outgoing.channel)
+        for stream in outgoing.streams:
+            del self._by_stream[stream]
+        if self._goals is not None:
+            self._goals.withdrawn(outgoing.name)
+        self._withdraw(outgoing.channel, outgoing.source)
+        opened = self._open(outgoing.info, wanted)
+        if opened is None:
+            del self._topics[outgoing.name]
+            outgoing.subscription.close()
             return
-        outgoing = self._topics[info.name] = Outgoing(info.name, channel, subscription, source, sink)
-        self._by_stream.update(dict.fromkeys(outgoing.streams, outgoing))
-        _log.info(
-            "offering %s (%s) as %s: class %s, %s", info.name, info.type_name, name,
-            CLASS_LABELS[channel.spec.priority], "reliable" if channel.spec.reliable else "best effort",
-        )  # fmt: skip
-        self._site.kick()
+        outgoing.channel, outgoing.source, entry = opened
+        outgoing.resolved = wanted
+        outgoing.entry.become(entry)
+        if outgoing.source is None and wanted.spec.latched:
+            for message in latched:  # as the bodies have left before
+                self._core.send(
+                    outgoing.channel, message.body, message.stamp_ns, born_s=message.born_s, now=clock.now()
+                )
+        outgoing.entry.replay(waiting)
+        self._offered(outgoing)
 
     def topic_removed(self, name: TopicName) -> None:
+        self._known.pop(name, None)
+        self._remove(name)
+
+    def _remove(self, name: TopicName) -> None:
         outgoing = self._topics.pop(name, None)
         if outgoing is not None:
+            if self._changing.pop(name, None) is not None:
+                outgoing.entry.open()
             for stream in outgoing.streams:
                 del self._by_stream[stream]
             if self._goals is not None:
@@ -233,10 +362,6 @@ class Outbound:
         if static:
             return channel, LatchedTransforms(core, channel, send, info.name, info.encoding)
         return channel, MergedTransforms(core, channel, send, info.name, info.encoding, max_rate_hz=capped_hz)
-
-    def _sink(self, channel: OutChannel, rewrite: Rewrite | None) -> Sink:
-        send = self._send(channel, rewrite)
-        return lambda body, stamp_ns: send(body, stamp_ns, None)
 
     def _kept(self, info: TopicInfo, channel: OutChannel, durable: DurableTopics) -> Sink:
         """What keeps messages, and sends them when they are on disk."""
@@ -348,7 +473,7 @@ class Outbound:
             if outgoing is not None:
                 outgoing.subscription.close()
                 try:
-                    outgoing.subscription = self._site.endpoint.subscribe(name, outgoing.sink)
+                    outgoing.subscription = self._site.endpoint.subscribe(name, outgoing.entry.take)
                 except UsageError as error:
                     _log.error("%s cannot be taken again: %s", name, error)
                     self.topic_removed(name)

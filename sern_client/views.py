@@ -22,7 +22,8 @@ MAX_TOLD: Final = 100
 
 
 class ClientViews:
-    """The routes of one client. `reason` says why there is no link, `address` where the relay is."""
+    """The routes of one client. `reason` says why there is no link, `address` where the relay is, `by_hand` what is set
+    so."""
 
     def __init__(
         self,
@@ -34,6 +35,7 @@ class ClientViews:
         *,
         reason: Callable[[], str],
         address: Callable[[], str],
+        by_hand: Callable[[], dict[str, Any]] = dict,
     ) -> None:
         self._name = name
         self._bridge = bridge
@@ -43,6 +45,7 @@ class ClientViews:
         self._events = events
         self._reason = reason
         self._address = address
+        self._by_hand = by_hand
 
     def routes(self) -> dict[str, JsonSource | JsonQuery]:
         link, received = self._core.link, self._core.received
@@ -68,6 +71,7 @@ class ClientViews:
             "refused": dict(list(outbound.refused.items())[:MAX_TOLD]),
             "subscriptions_refused": list(inbound.subscription_problems)[:MAX_TOLD],
             "subscribed": list(self._core.subscription.patterns),
+            "by_hand": self._by_hand(),
             "stays_here": list(outbound.unnamed)[:MAX_TOLD],
             "now_s": now,
         }

@@ -31,7 +31,6 @@ from sern_relay.keyring import OwnKeys, RelayKeyring
 from sern_relay.readers import Readers
 from sern_relay.refusals import Refusals
 from sern_relay.relay_metrics import register_relay
-from sern_relay.reload_state import ReloadState
 from sern_relay.server import RelayServer
 from sern_relay.transforms import TransformObjects
 from sern_relay.udp import RelayLanes
@@ -55,6 +54,7 @@ from sern_runtime.message_log import LoggedFates, MessageLog
 from sern_runtime.metrics import Metrics
 from sern_runtime.open_files import require_open_files
 from sern_runtime.optional import OptionalParts
+from sern_runtime.reload_state import ReloadState
 from sern_runtime.sdnotify import Notifier, Watchdog
 from sern_runtime.zap import ZapHandler, self_test
 

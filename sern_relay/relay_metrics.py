@@ -9,7 +9,6 @@ from sern_relay.durable import DurableHolding
 from sern_relay.feed import RelayFeed
 from sern_relay.keyring import RelayKeyring
 from sern_relay.readers import Readers
-from sern_relay.reload_state import ReloadState
 from sern_relay.server import RelayServer
 from sern_relay.transforms import TransformObjects
 from sern_runtime.adaptation import Adaptation
@@ -20,6 +19,7 @@ from sern_runtime.internal_errors import InternalErrors
 from sern_runtime.link_metrics import register_codecs, register_links, register_received
 from sern_runtime.metrics import Metrics
 from sern_runtime.optional import OptionalParts
+from sern_runtime.reload_state import ReloadState
 from sern_runtime.zap import ZapHandler
 
 

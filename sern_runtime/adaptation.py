@@ -46,20 +46,31 @@ class Adaptation:
     ) -> None:
         """`rules` say of which classes summaries may be chosen, `summaries` are those there are now. What fails is
         counted in `parts`, under PART."""
-        encodes = coder is not None
-        self._section = section
+        self._encodes = coder is not None
         self._parts = parts or OptionalParts(PART)
         self._resting: dict[Link, tuple[float, float]] = {}  # links whose adapter failed: until when, and the pause
         self._links = links
         self._coder = coder
         self._kick = kick
-        self._params = section.params(encodes=encodes)
         self._summaries = summaries
-        classes = {rule.priority for rule in rules if any(spec.adapt for spec in rule.summaries)}
-        self._summarised = tuple(priority for priority in CLASSES if priority in classes)
-        self._make_policy = section.make_policy(encodes=encodes, summarised=self._summarised)
+        self._set(section, rules)
         self._adapters: dict[Link, HopAdapter] = {}
         self._history: dict[Link, deque[dict[str, Any]]] = {}
+
+    def _set(self, section: AdaptationSection, rules: Iterable[TopicRule]) -> None:
+        classes = {rule.priority for rule in rules if any(spec.adapt for spec in rule.summaries)}
+        summarised = tuple(priority for priority in CLASSES if priority in classes)
+        make_policy = section.make_policy(encodes=self._encodes, summarised=summarised)
+        self._section, self._params = section, section.params(encodes=self._encodes)
+        self._summarised, self._make_policy = summarised, make_policy
+
+    def use(self, section: AdaptationSection, rules: Iterable[TopicRule]) -> None:
+        """Choose by another section, or for other rules, from now on: every link is begun with anew where that changes
+        anything. Raises ConfigError where the section cannot be used here; then all stays as it was."""
+        before = (self._section, self._summarised)
+        self._set(section, rules)
+        if (self._section, self._summarised) != before:
+            self.reset()
 
     async def run(self) -> None:
         """Until cancelled. An interval that comes late is a longer one; none is made up for."""

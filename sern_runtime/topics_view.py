@@ -30,7 +30,8 @@ def link_rows(link: Link, *, direction: str) -> Iterator[tuple[str, TopicView]]:
         yield (
             counters.topic,
             {
-                "class": CLASS_LABELS[counters.priority],
+                # The counters are of the class that the topic had first: what was counted stays where it is.
+                "class": CLASS_LABELS[counters.priority if newest is None else newest.spec.priority],
                 "direction": direction,
                 "wanted": any(stream.wanted for stream in streams),
                 "answered": any(stream.wanted is not None for stream in streams),

@@ -14,6 +14,7 @@ from sern_tools.top_state import (
     UNKNOWN,
     Change,
     Flow,
+    Json,
     LinkLine,
     Sample,
     TopicLine,
@@ -42,6 +43,8 @@ ON_ARRIVAL: Final = frozenset({
 STILL_S: Final = 3.0
 """A topic of which nothing came for so long is worth a word, unless it is latched."""
 DENIED: Final = 3
+SET_SHOWN: Final = 5
+"""Topics that are shown with what is set of them by hand."""
 """Refusals of the access rules that a relay is asked about."""
 MUCH: Final = 0.1
 """A share of what is offered whose loss is worth a word."""
@@ -122,6 +125,7 @@ class _Situation:
         self._denied: list[str] = row.get("subscriptions_refused", [])
         self._wants: list[str] = row.get("subscribed", [])
         self._stays: list[str] = row.get("stays_here", [])
+        self._set: Json = row.get("by_hand", {})
         self._summaries = {
             item["stream"].rpartition(f"/{item['kind']}")[0] or item["stream"]: item
             for item in row.get("summaries", ())
@@ -262,6 +266,7 @@ class _Situation:
         if self._stays:
             some = ", ".join(self._stays[:3]) + (", ..." if len(self._stays) > 3 else "")
             yield NOTE, f"stays here, as no rule in `topics` names it: {some}"
+        yield from _by_hand(self._set)
         names = {literal(pattern) for pattern in self._wants}
         for text in self._denied:
             if not any(name in text.replace(":", " ").split() for name in names if name):
@@ -272,6 +277,19 @@ class _Situation:
                 yield BAD, text.partition(": ")[2]
         if refused > 0:
             yield WARN, f"{refused} connections were refused just now: `sern clients` says whose"
+
+
+def _by_hand(said: Json) -> Iterator[Word]:
+    """What somebody has set at the daemon and no file says."""
+    for name, keys in list(said.get("topics", {}).items())[:SET_SHOWN]:
+        words = " ".join(f"{key}={value}" for key, value in keys.items())
+        waits = ", once what it owes is delivered" if name in said.get("changing", ()) else ""
+        yield NOTE, f"set by hand: {name} {words}{waits}"
+    more = len(said.get("topics", {})) - SET_SHOWN
+    if more > 0:
+        yield NOTE, f"set by hand: {more} more topics; `sern set` lists them"
+    if said.get("profile"):
+        yield NOTE, f"set by hand: profile {said['profile']}"
 
 
 def literal(pattern: str) -> str | None:

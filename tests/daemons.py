@@ -261,7 +261,7 @@ class Lab:
         """NAME.yaml, with new keys unless they exist; `client` and `relay` are merged, the rest is replaced."""
         if self.secure and not (self.directory / f"{name}.key").exists():
             self.make_keys(name)
-        sections = {"discovery": {"mode": "dynamic"}} | self._said(name) | sections
+        sections = {"discovery": {"mode": "dynamic"}, "local": {"listen": False}} | self._said(name) | sections
         content = client_content(name, self.endpoint, endpoint, secure=self.secure, **sections)
         return write(self.directory, name, content)
 

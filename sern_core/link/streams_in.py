@@ -229,8 +229,14 @@ class StreamsIn:
     def hand_on(self, now: float) -> None:
         """Deliver commands and poses: everything that had arrived with them has been looked at."""
         self._end.now = now
+        newest: dict[InStream, Message] = {}
+        if len(self._fresh) > 1:
+            newest = {stream: message for stream, message, _ in self._fresh if stream.newest_alone}
         while self._fresh:
             stream, message, steps = self._fresh.popleft()
+            if stream.newest_alone and newest.get(stream, message) is not message:
+                self._in_drop(stream, DropReason.SUPERSEDED, len(message.body), (message.seq,), reported=False)
+                continue
             lifespan_s = stream.lifespan_s
             aged = lifespan_s is not None and now - message.born_s + message.error_s > lifespan_s  # while it lay here
             if aged or steps != self._lanes.clock.steps:

@@ -29,10 +29,9 @@ from typing import Final
 from sern_core.bodies.codecs import Work, decode
 from sern_core.objects.values import Entry, ObjectLimits, ObjectValues
 from sern_core.objects.xr_object import ChangedIds, ObjectChanges, XrObject
-from sern_core.topics.rules import COMMAND_TYPES
 from sern_core.vocabulary.codec_names import Codec
 from sern_core.vocabulary.errors import CodecError, RefusedError
-from sern_core.vocabulary.message import StreamId, StreamInfo
+from sern_core.vocabulary.message import COMMAND_TYPES, StreamId, StreamInfo
 from sern_core.vocabulary.names import plain_type
 from sern_core.vocabulary.types import ClientName, ObjectKind, PriorityClass, TopicName
 

@@ -65,7 +65,8 @@ class ClientEvents(Protocol):
 
     def stream_closed(self, stream: StreamInfo) -> None: ...
 
-    def message(self, stream: StreamInfo, message: Message, *, now: float) -> None: ...
+    def message(self, stream: StreamInfo, message: Message, *, now: float) -> DropReason | None:
+        """A message of an open stream has its turn. Returns why it was not taken; None: it was."""
 
     def expired(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
         """A reliable message of a stream from elsewhere was dropped on its way; it is reported in its turn."""
@@ -222,6 +223,11 @@ class ClientCore:
         self._numbering.ended(channel.stream.id, channel.next_seq - 1, now=now)
         self._latched.pop(channel.stream.id, None)
         self.link.outgoing.close(channel, DropReason.SHUTDOWN, now=now)
+
+    def latched(self, channel: OutChannel) -> list[Message]:
+        """What late joiners of a latched topic would get, the oldest first."""
+        cache = self._latched.get(channel.stream.id)
+        return [] if cache is None else list(cache.replay())
 
     def send(
         self,
@@ -399,6 +405,14 @@ class ClientCore:
             if stream.stream.id in self._refused and self._open_stream(stream):
                 self.link.answers.answer(stream, True, now=now)
 
+    def reopen(self, identities: Collection[StreamId], *, now: float) -> None:
+        """Close these streams from elsewhere for the shell, and open them anew: what holds for them here has changed.
+        The stream itself goes on."""
+        for stream in list(self.link.taking.incoming.values()):
+            if stream.stream.id in identities and stream.stream.id in self._open:
+                self._close_stream(stream, now)
+                self.link.answers.answer(stream, self._open_stream(stream), now=now)
+
     @property
     def refused(self) -> Collection[StreamId]:
         """The streams from elsewhere that there are, and that this site could not publish."""
@@ -447,11 +461,14 @@ class ClientCore:
             self._tell(self.events.expired, stream.stream, message.seq, reason)
             return
         try:
-            self.events.message(stream.stream, message, now=now)
+            refused = self.events.message(stream.stream, message, now=now)
         except Exception as error:  # noqa: BLE001  (of one message: the stream goes on, whatever its bodies do)
             self.fault(error)
             self._failed(stream, message, DropReason.FAULT, "", now)
         else:
+            if refused is not None:
+                self._failed(stream, message, refused, "", now)
+                return
             self.received.of(stream.stream).arrived(len(message.body), now - message.born_s, now)
             if self.trace.steps:
                 self.trace.record(

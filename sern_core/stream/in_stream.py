@@ -16,7 +16,8 @@ from typing import Final
 from sern_core.stream.drop_reports import DropReports, UnackedReports
 from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.limits import LIMITS, PeerLimits
-from sern_core.vocabulary.message import Message, StreamInfo
+from sern_core.vocabulary.message import COMMAND_TYPES, Message, StreamInfo
+from sern_core.vocabulary.names import plain_type
 from sern_core.vocabulary.types import DROP_CODES, DROP_REASONS, DropReason, PriorityClass
 from sern_core.wire.framing import FLAG_DROP_MARKER, FLAG_REPLAY, Datagram
 
@@ -222,8 +223,11 @@ class InStream:
         self.reliable = stream.spec.reliable
         self.lifespan_s = stream.spec.lifespan_s
         control = stream.spec.priority is PriorityClass.CONTROL
+        command = plain_type(stream.info.type_name) in COMMAND_TYPES
         self.perishable = control and not self.reliable and self.lifespan_s is not None
         """A command or a pose: nobody shall have it too late."""
+        self.newest_alone = self.perishable and stream.spec.depth == 1 and command
+        """Of commands that come together the robot gets the newest: after an outage there is no burst of them."""
         self.delivered = first - 1
         self.confirmed = first - 1  # what the peer was told (`StreamsIn.confirm`)
         self.unhandled = 0  # the first seq that had its turn and is still being decoded; 0: none

@@ -18,6 +18,7 @@ from sern_core.topics.patterns import Pattern, PatternSet, compile_pattern
 from sern_core.vocabulary.codec_names import DEFAULT_LOSSY, Compression, LossyParams
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.message import (
+    COMMAND_TYPES,
     DEFAULT_COMMAND_LIFESPAN_S,
     DEFAULT_LIFESPAN_S,
     DEFAULT_RELIABLE_QUEUE_BYTES,
@@ -32,12 +33,7 @@ from sern_core.vocabulary.types import ClientName, Durability, Encoding, Priorit
 
 DEFAULT_RELIABLE_DEPTH: Final = 10
 DEFAULT_BEST_EFFORT_DEPTH: Final = 1
-LEASE_REPEAT_HZ: Final = 10.0
-LEASE_REPEAT_S: Final = 1.0
-"""When a lease runs out its message is published at `LEASE_REPEAT_HZ` for `LEASE_REPEAT_S`, then no more."""
 
-COMMAND_TYPES: Final = frozenset({"geometry_msgs/Twist", "geometry_msgs/TwistStamped"})
-"""Types whose all-zero message means "stand still": the only ones that `on_link_loss` may publish."""
 ODOMETRY_TYPE: Final = "nav_msgs/Odometry"
 """The one type of poses that `dead_reckoning` is for: it says how fast the robot is."""
 MANY_WRITER_TOPICS: Final = frozenset({"/tf", "/tf_static"})
@@ -84,14 +80,27 @@ class Direction(StrEnum):
 
 class LossAction(StrEnum):
     ZERO = "zero"  # the all-zero message of the topic's type
+    RAMP = "ramp"  # the last command, slower and slower, then one of zero
+
+
+@dataclass(frozen=True, slots=True)
+class Ramp:
+    """How a robot is slowed down when commands stay away: a command holds for `hold_s` past the usual time between
+    commands, then its velocities shrink by no more than these limits (m/s² and rad/s²)."""
+
+    hold_s: float
+    linear_mps2: float
+    angular_radps2: float
 
 
 @dataclass(frozen=True, slots=True)
 class Lease:
-    """A command topic is a lease: without a fresh command for `after_s`, whatever the cause, `publish` happens."""
+    """A command topic is a lease: without a fresh command for `after_s`, whatever the cause, `publish` happens. `ramp`:
+    how, and how much earlier, where it is a ramp."""
 
     publish: LossAction
     after_s: float
+    ramp: Ramp | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,6 +25,8 @@ DURABLE_RETENTION_S: Final = 7 * 86_400.0
 """The same of a durable topic: what outlives the machine's power may outlast a weekend."""
 DEFAULT_RELIABLE_QUEUE_BYTES: Final = 32 * 2**20
 """Bytes of undelivered reliable messages a topic may hold; above it new ones are refused to the sender."""
+COMMAND_TYPES: Final = frozenset({"geometry_msgs/Twist", "geometry_msgs/TwistStamped"})
+"""Types whose all-zero message means "stand still": the only ones that `on_link_loss` may publish."""
 KAPPA: Final = (10.0, 3.0, 1.0)
 """κ of the paper's eq. (priority_score), per class, when a rule gives no weight."""
 

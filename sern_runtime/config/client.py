@@ -15,18 +15,18 @@ from sern_core.summaries.spec import TooLarge
 from sern_core.topics.patterns import MAX_CLIENT_PROGRAM, PatternError, PatternSet, compile_pattern
 from sern_core.topics.rules import (
     AUTO,
-    COMMAND_TYPES,
     Direction,
     Discovery,
     DiscoveryMode,
     Lease,
     LossAction,
+    Ramp,
     RuleError,
     RuleSet,
     TopicRule,
 )
 from sern_core.vocabulary.codec_names import DEFAULT_LOSSY, Compression, LossyParams
-from sern_core.vocabulary.message import DEFAULT_RELIABLE_QUEUE_BYTES
+from sern_core.vocabulary.message import COMMAND_TYPES, DEFAULT_RELIABLE_QUEUE_BYTES
 from sern_core.vocabulary.names import name_problem, normal_namespace
 from sern_core.vocabulary.types import ClientName, Durability, ObjectKind, PriorityClass, Reliability, TopicName
 from sern_runtime.config.adaptation import AdaptationSection
@@ -63,6 +63,7 @@ from sern_runtime.config.shared import (
     DurableSection,
     HttpSection,
     LinkSection,
+    LocalSection,
     LogSection,
     SchedulerSection,
     output_problems,
@@ -156,9 +157,30 @@ class LossSection(Section):
     """What this site publishes on a command topic when commands stop coming."""
 
     publish: LossAction
-    """`zero`: the all-zero command (stand still)."""
-    after_s: Annotated[float, Field(gt=0, le=60)]
-    """Without a fresh command for so long, whatever the cause; repeated at 10 Hz for 1 s."""
+    """`zero`: the all-zero command (stand still), repeated at 10 Hz for 1 s; `ramp`: the last command slower and slower
+    within the limits below, for 3 s at the longest, then one all-zero command."""
+    after_s: Annotated[float, Field(gt=0, le=60)] = 0.5
+    """Without a fresh command for so long, whatever the cause: counted from when the last one was given. A ramp begins
+    earlier, where the commands came more often than that."""
+    hold_s: Annotated[float, Field(ge=0, le=10)] = 0.125
+    """`ramp`: how late the next command may be, past the usual time between commands (the median of the last 8), before
+    the robot is slowed down. This much jitter of the link it does not notice."""
+    linear_mps2: Annotated[float, Field(gt=0, le=1000)] = 2.0
+    """`ramp`: the fastest that it is slowed down, m/s². Both velocities shrink together: it stays on its arc."""
+    angular_radps2: Annotated[float, Field(gt=0, le=1000)] = 4.0
+    """`ramp`: the same of its turning, rad/s²."""
+
+    @model_validator(mode="after")
+    def _of_a_ramp(self) -> "LossSection":
+        for key in ("hold_s", "linear_mps2", "angular_radps2"):
+            if self.publish is not LossAction.RAMP and key in self.model_fields_set:
+                raise fault("belongs to publish: ramp; leave it out, or choose that", key)
+        return self
+
+    def lease(self) -> Lease:
+        """The lease as the core reads it."""
+        ramp = Ramp(self.hold_s, self.linear_mps2, self.angular_radps2) if self.publish is LossAction.RAMP else None
+        return Lease(self.publish, self.after_s, ramp)
 
 
 _COMMAND: Final = re.compile("cmd|command|joy|teleop|twist", re.IGNORECASE)
@@ -342,7 +364,7 @@ class TopicSection(Section):
             compression=None if self.compression == "auto" else Compression(self.compression),
             lossy=tuple(Compression(mode) for mode in self.lossy),
             lossy_params=LossyParams(self.voxel_m, self.jpeg_quality),
-            lease=None if loss is None else Lease(publish=loss.publish, after_s=loss.after_s),
+            lease=None if loss is None else loss.lease(),
             summaries=specs(self.summary),
             too_large=TooLarge(self.too_large),
             merge_tf=self.merge_tf,
@@ -496,6 +518,8 @@ class ClientFile(FileModel):
     """What this site's nodes are told of the link, and of who is there behind it."""
     http: HttpSection = HttpSection()
     """Metrics and health over HTTP; off by default."""
+    local: LocalSection = LocalSection()
+    """The socket for tools of this machine."""
     log: LogSection = LogSection()
     """The log."""
     message_log: PathText | None = None

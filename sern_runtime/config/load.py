@@ -5,7 +5,7 @@
 
 import difflib
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Generic, TypeVar, get_args
@@ -19,6 +19,7 @@ from sern_runtime.config.renamed import renamed_key, renamed_value
 from sern_runtime.config.yaml import Document, Loc, Node, parse_document, read_document
 
 M = TypeVar("M", bound=FileModel)
+S = TypeVar("S", bound=Section)
 
 SHOWN_CHARS: Final = 60
 _SECRET_KEYS: Final = frozenset({"secret_key"})
@@ -90,6 +91,16 @@ def check_document(document: Document, path: Path, model: type[M], *, files: boo
         return Checked(None, _in_order(errors))
     warnings = [document.error(item.loc, item.problem) for item in problems if item.warning]
     return Checked(Loaded(placed, path, tuple(str(warning) for warning in warnings)))
+
+
+def checked_section(data: Mapping[str, Any], model: type[S]) -> S:
+    """One section that is in no file. Raises ConfigError with the key at fault and what is wrong with it."""
+    text = json.dumps(data)
+    document = parse_document(text.encode(), file="")
+    try:
+        return model.model_validate_json(text)
+    except ValidationError as error:
+        raise _render(document, model, error.errors(include_url=False, include_input=False)[0]) from None
 
 
 def _without_echoes(details: list[ErrorDetails]) -> list[ErrorDetails]:

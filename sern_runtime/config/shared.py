@@ -176,6 +176,15 @@ class LogFormat(StrEnum):
     JSON = "json"
 
 
+class LocalSection(Section):
+    """The socket on which tools of this machine change what runs: `sern set`, `sern take`, `sern release`."""
+
+    listen: bool = True
+    """Whether there is one. It has mode 0600: this client's user and root may use it."""
+    socket: PathText | None = None
+    """Where it is; null: NAME.sock in the unit's runtime directory, else in $XDG_RUNTIME_DIR/sern or /tmp/sern-UID."""
+
+
 class LogSection(Section):
     """The log, on standard error."""
 

@@ -15,6 +15,7 @@ from tests.support import child
 UNITS: Final = Path(__file__).resolve().parents[2] / "deploy" / "systemd"
 NAMES: Final = ("sern-relay.service", "sern-client.service", "sern-client@.service", "sern-twin.service",
                 "sern-navigation.service")  # fmt: skip
+NOT_NAVIGATION: Final = ("ExecReload", "RuntimeDirectory", "RuntimeDirectoryMode")  # no keys, and no local socket
 ONCE: Final = {
     ("Unit", "StartLimitIntervalSec"): "0",
     ("Service", "Type"): "notify",
@@ -34,6 +35,7 @@ KNOWN: Final = {
     "Unit": {"Description", "After", "StartLimitIntervalSec"},
     "Service": {
         "Type NotifyAccess ExecStart ExecReload User Group UMask WorkingDirectory StateDirectory StateDirectoryMode",
+        "RuntimeDirectory RuntimeDirectoryMode",
         "Restart RestartSec WatchdogSec KillSignal TimeoutStopSec LimitNOFILE LimitCORE NoNewPrivileges",
         "CapabilityBoundingSet ProtectSystem ProtectHome PrivateTmp PrivateDevices ProtectKernelTunables",
         "ProtectKernelModules ProtectKernelLogs ProtectControlGroups ProtectClock ProtectHostname LockPersonality",
@@ -99,6 +101,7 @@ def test_the_template_is_the_client_with_its_name_in_it() -> None:
         "ExecStart": "/opt/sern/bin/sern-client --config /etc/sern/%i.yaml",
         "WorkingDirectory": "/var/lib/sern/%i",
         "StateDirectory": "sern sern/%i",
+        "RuntimeDirectory": "sern-client-%i",
     }
     single = read("sern-client.service")
     assert read("sern-client@.service") == [(s, key, expected.get(key, value)) for s, key, value in single]
@@ -106,6 +109,7 @@ def test_the_template_is_the_client_with_its_name_in_it() -> None:
 
 def test_that_of_the_twins_is_the_client_with_another_program() -> None:
     expected = {"Description": "SERN twins", "ExecStart": "/opt/sern/bin/sern-twin --config /etc/sern/twin.yaml"}
+    expected["RuntimeDirectory"] = "sern-twin"
     client = read("sern-client.service")
     assert read("sern-twin.service") == [(s, key, expected.get(key, value)) for s, key, value in client]
 
@@ -115,7 +119,7 @@ def test_that_of_the_navigation_is_the_client_with_another_program() -> None:
         "Description": "SERN navigation",
         "ExecStart": "/opt/sern/bin/sern-navigation --config /etc/sern/navigation.yaml",
     }
-    client = [entry for entry in read("sern-client.service") if entry[1] != "ExecReload"]  # it has no keys
+    client = [entry for entry in read("sern-client.service") if entry[1] not in NOT_NAVIGATION]
     assert read("sern-navigation.service") == [(s, key, expected.get(key, value)) for s, key, value in client]
 
 

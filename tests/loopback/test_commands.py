@@ -80,9 +80,13 @@ class Commands:
         return [command for command in self.obeyed if command.at_s > at_s]
 
 
-def robot_file(lab: Lab) -> Path:
+RAMP: dict[str, Any] = {"publish": "ramp", "after_s": AFTER_S, "linear_mps2": 1.0, "angular_radps2": 1.0}
+RAMP_RULES: list[dict[str, Any]] = [{**ROBOT_RULES[0], "on_link_loss": RAMP}, *ROBOT_RULES[1:]]
+
+
+def robot_file(lab: Lab, rules: list[dict[str, Any]] = ROBOT_RULES) -> Path:
     endpoint = {"kind": "synthetic", "role": "robot", "topics": ["/pose"]}
-    return lab.client_file("robot1", endpoint, topics=ROBOT_RULES, discovery={"mode": "manual"})
+    return lab.client_file("robot1", endpoint, topics=rules, discovery={"mode": "manual"})
 
 
 def operator_file(lab: Lab) -> Path:
@@ -107,13 +111,13 @@ def check_stop(commands: Commands) -> None:
 async def driven(robot: ClientDaemon, commands: Commands) -> int:
     """Wait until the robot is being driven; how often its lease has run out so far, as it does on a busy machine."""
     await until(lambda: len(commands.moving) > 10 and commands.obeyed[-1].twist != STILL, "the robot is driven")
-    return robot.bridge.inbound.leases_fired
+    return robot.bridge.inbound.commands.leases_fired
 
 
 async def stood(robot: ClientDaemon, commands: Commands, fired: int) -> None:
     """Wait until the lease has run out once more than `fired` times, and said all it has to say."""
-    await until(lambda: robot.bridge.inbound.leases_fired > fired and commands.obeyed[-1].twist == STILL)
-    await until(lambda: robot.bridge.inbound.lease_due_s is None, "the stop command has been repeated")
+    await until(lambda: robot.bridge.inbound.commands.leases_fired > fired and commands.obeyed[-1].twist == STILL)
+    await until(lambda: robot.bridge.inbound.commands.due_s is None, "the stop command has been repeated")
     told = {record.event for record in robot.core.trace.records(TopicName("/robot1/cmd_vel"))}
     assert TraceEvent.LEASE_EXPIRED in told and TraceEvent.DELIVERED in told
 
@@ -160,6 +164,30 @@ async def test_a_killed_operator_leaves_a_robot_that_stands(tmp_path: Path, capl
         await until(lambda: len(commands.obeyed) > count)
         assert commands.obeyed[count].twist != STILL
         await site.stop()
+        await lab.end(robot)
+        await lab.end(relay)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+async def test_a_robot_with_a_ramp_is_slowed_down_whether_its_operator_is_killed_or_leaves(
+    tmp_path: Path, number: signal.Signals, caplog: pytest.LogCaptureFixture
+) -> None:
+    commands = Commands()
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        relay = await lab.relay()
+        robot = await lab.client(robot_file(lab, RAMP_RULES), commands.watch)
+        site = lab.process(operator_file(lab))
+        await driven(robot, commands)
+        at_s = time.monotonic()
+        site.signal(number)
+        await site.ended()
+        inbound = robot.bridge.inbound
+        await until(lambda: commands.obeyed[-1].twist == STILL and inbound.commands.due_s is None, "the robot stands")
+        assert "/cmd_vel: no fresh command; slowing the robot down" in caplog.messages
+        # The operator drives at one speed: what is slower is said by the robot's own client.
+        speeds = [command.twist[0] for command in commands.after(at_s)]
+        assert speeds == sorted(speeds, reverse=True) and len(set(speeds)) > 3
+        assert speeds.count(0.0) == 1, "one zero"
         await lab.end(robot)
         await lab.end(relay)
 

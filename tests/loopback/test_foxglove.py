@@ -72,8 +72,8 @@ async def test_a_person_looks_and_drives(tmp_path: Path) -> None:
                 seen = len(person.got["/robot1/pose"])
                 await until(lambda seen=seen: len(person.got["/robot1/pose"]) > seen)  # type: ignore[misc]
             assert simulated.received("/cmd_vel") is not None
-        fired = robot.bridge.inbound.leases_fired
-        await until(lambda: robot.bridge.inbound.leases_fired > fired or simulated.state().speed_mps == 0.0)
+        fired = robot.bridge.inbound.commands.leases_fired
+        await until(lambda: robot.bridge.inbound.commands.leases_fired > fired or simulated.state().speed_mps == 0.0)
         assert endpoint.drops == {}
         for daemon in (site, robot, relay):
             await lab.end(daemon)

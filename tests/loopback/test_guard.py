@@ -18,7 +18,7 @@ from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import clock, ros_types
 from sern_runtime.config.client import load_client
 from tests.daemons import HOST, Lab, Process
-from tests.loopback.test_commands import OPERATOR_RULES, ROBOT_RULES, STILL
+from tests.loopback.test_commands import OPERATOR_RULES, RAMP_RULES, ROBOT_RULES, STILL
 from tests.sern_client.endpoints.ros1.fakes import FakeMaster, running
 from tests.support import Events, until
 
@@ -47,6 +47,7 @@ main()
 class Told(NamedTuple):
     at_s: float
     moves: bool
+    forward_mps: float
 
 
 class Robot:
@@ -62,7 +63,7 @@ class Robot:
 
     def _heard(self, body: bytes, _stamp_ns: int) -> bool:
         twist = ros_types.deserialise(body, TWIST, Encoding.ROS1)
-        self.told.append(Told(clock.now(), (twist.linear.x, twist.angular.z) != STILL))
+        self.told.append(Told(clock.now(), (twist.linear.x, twist.angular.z) != STILL, twist.linear.x))
         return True
 
     def moving(self, after_s: float = 0.0) -> list[Told]:
@@ -82,7 +83,7 @@ class Scene(NamedTuple):
 
 
 @asynccontextmanager
-async def driving(tmp_path: Path) -> AsyncIterator[Scene]:
+async def driving(tmp_path: Path, rules: list[dict[str, Any]] = ROBOT_RULES) -> AsyncIterator[Scene]:
     """A robot with a ROS 1 master that is being driven, and its guard is at the master too."""
     master, robot = FakeMaster(), Robot()
     await master.start()
@@ -94,7 +95,7 @@ async def driving(tmp_path: Path) -> AsyncIterator[Scene]:
             Lab(tmp_path, "robot1", "site") as lab,
         ):
             endpoint = {"kind": "ros1", "master_uri": master.uri, "host": HOST, "poll_hz": 20}
-            file = lab.client_file("robot1", endpoint, topics=ROBOT_RULES, discovery={"mode": "manual"})
+            file = lab.client_file("robot1", endpoint, topics=rules, discovery={"mode": "manual"})
             await lab.relay()
             client = lab.process(file, before=[sys.executable, str(script)])
             where = {"kind": "synthetic", "role": "operator", "command_topic": "/robot1/cmd_vel", "command_rate_hz": 20}
@@ -154,6 +155,19 @@ async def test_the_robot_stands_when_its_client_is_no_more(tmp_path: Path, numbe
             resumed_s = clock.now()
             await until(lambda: robot.moving(resumed_s))
             await client.stop()
+        await scene.operator.stop()
+
+
+async def test_a_robot_with_a_ramp_is_slowed_down_by_the_guard_of_a_client_that_was_killed(tmp_path: Path) -> None:
+    async with driving(tmp_path, RAMP_RULES) as scene:
+        robot, client = scene.robot, scene.client
+        client.kill()
+        at_s = clock.now()
+        await until(lambda: robot.stops(at_s), "the robot stands")
+        assert "/cmd_vel: the client has ended; slowing the robot down" in client.text
+        speeds = [told.forward_mps for told in robot.told if told.at_s > at_s]
+        assert len(speeds) > 2 and speeds == sorted(speeds, reverse=True) and speeds.count(0.0) == 1
+        await until(lambda: publishers(scene.master) == {"/sern_robot1"}, "the guard ends; the dead stay listed")
         await scene.operator.stop()
 
 

@@ -214,7 +214,7 @@ async def test_metrics_are_read_when_they_are_asked_for(tmp_path: Path) -> None:
         ),
     )
     inbound = daemon.bridge.inbound
-    inbound.publish_failures, inbound.leases_fired, daemon.check.total = 3, 2, 1
+    inbound.publish_failures, inbound.commands.leases_fired, daemon.check.total = 3, 2, 1
     inbound.deadlines_missed[TopicName("/pose")] = 4
     text = generate_latest(registry).decode()
     for line in (

@@ -7,14 +7,14 @@ from typing import Any
 
 import pytest
 
-from sern_client import inbound
+from sern_client import commands, inbound
 from sern_client.endpoints.base import Difference
 from sern_client.inbound import Inbound
 from sern_client.site import Site
 from sern_client.tables import Tables
 from sern_core.site.services import call_name
 from sern_core.topics.patterns import compile_pattern
-from sern_core.topics.rules import Direction, Lease, LossAction, RuleSet, TopicRule
+from sern_core.topics.rules import Direction, Lease, LossAction, Ramp, RuleSet, TopicRule
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.ledger import OTHER_TOPIC
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicSpec
@@ -37,6 +37,21 @@ def stream(name: str, type_name: str = TEXT, kind: TopicSpec | None = None) -> S
     return StreamInfo(StreamId(ClientName("robot"), 1, info.name), info, kind or spec(), {})
 
 
+def ramped(after_s: float = FOR_EVER_S, decelerate: float = 100.0) -> TopicRule:
+    lease = Lease(LossAction.RAMP, after_s, Ramp(0.125, decelerate, decelerate))
+    return TopicRule(compile_pattern(COMMANDS), priority=PriorityClass.CONTROL, lease=lease)
+
+
+def drive(forward_mps: float) -> bytes:
+    linear = ros_types.new("geometry_msgs/msg/Vector3", Encoding.CDR, x=forward_mps, y=0.0, z=0.0)
+    still = ros_types.new("geometry_msgs/msg/Vector3", Encoding.CDR, x=0.0, y=0.0, z=0.0)
+    return ros_types.serialise(ros_types.new(TWIST, Encoding.CDR, linear=linear, angular=still), TWIST, Encoding.CDR)
+
+
+def speeds(publisher: FakePublisher) -> list[float]:
+    return [ros_types.deserialise(body, TWIST, Encoding.CDR).linear.x for body in publisher.bodies]
+
+
 def leased(after_s: float = FOR_EVER_S, match: str = COMMANDS) -> TopicRule:
     lease = Lease(LossAction.ZERO, after_s)
     return TopicRule(compile_pattern(match), priority=PriorityClass.CONTROL, lease=lease)
@@ -47,18 +62,26 @@ class FakeGuard:
 
     def __init__(self, endpoint: FakeEndpoint) -> None:
         self.told: list[tuple[object, ...]] = []
+        self.commands: list[bytes | None] = []
+        self.slowing: list[bool] = []
         self._endpoint = endpoint
 
     def _published(self) -> int:
         return sum(len(publisher.bodies) for publisher in self._endpoint.publishers)
 
-    def opened(self, info: Any, stop: bytes) -> int:
+    def opened(self, info: Any, stop: bytes, _ramp: Ramp | None = None) -> int:
         assert stop == STOP
         self.told.append(("opened", info.name))
         return 1
 
-    def lease(self, key: int, due_s: float | None) -> None:
+    def commanded(self, key: int, due_s: float | None, command: bytes | None) -> None:
         assert key == 1
+        self.commands.append(command)
+        self.told.append(("lease", due_s is not None, self._published()))
+
+    def lease(self, key: int, due_s: float | None, *, since_s: float | None = None) -> None:
+        assert key == 1
+        self.slowing.append(since_s is not None)
         self.told.append(("lease", due_s is not None, self._published()))
 
     def closed(self, key: int) -> None:
@@ -246,7 +269,7 @@ async def test_a_command_stream_that_ends_stops_the_robot() -> None:
     here.bridge.stream_closed(opened)
     assert here.publisher.bodies == [b"go", STOP] and here.publisher.closed
     assert here.guard.told == [("opened", COMMANDS), ("lease", True, 0), ("closed", 2)]
-    assert here.inbound.leases_fired == 0
+    assert here.inbound.commands.leases_fired == 0
 
 
 async def test_a_robot_that_was_not_commanded_is_not_spoken_to() -> None:
@@ -262,10 +285,10 @@ async def test_the_end_of_the_client_stops_every_robot() -> None:
     for name in ("/r1/cmd_vel", "/r2/cmd_vel"):
         here.message(here.opened(name, TWIST), b"go")
     here.opened(POSE)
-    assert here.inbound.lease_due_s is not None
+    assert here.inbound.commands.due_s is not None
     here.bridge.close()
     assert [publisher.bodies for publisher in here.endpoint.publishers] == [[b"go", STOP], [b"go", STOP], []]
-    assert all(publisher.closed for publisher in here.endpoint.publishers) and here.inbound.lease_due_s is None
+    assert all(publisher.closed for publisher in here.endpoint.publishers) and here.inbound.commands.due_s is None
 
 
 async def test_a_stop_that_cannot_be_published_does_not_keep_the_next_robot_going() -> None:
@@ -283,13 +306,76 @@ async def test_without_fresh_commands_the_robot_is_stopped(caplog: pytest.LogCap
     here = Here(leased(0.001))
     opened = here.opened(COMMANDS, TWIST)
     here.message(opened, b"go")
-    assert here.inbound.lease_due_s is not None
+    assert here.inbound.commands.due_s is not None
     await until(lambda: len(here.publisher.bodies) > 1, "the first stop command")
-    assert here.publisher.bodies[:2] == [b"go", STOP] and here.inbound.leases_fired == 1
+    assert here.publisher.bodies[:2] == [b"go", STOP] and here.inbound.commands.leases_fired == 1
     assert here.guard.told[:3] == [("opened", COMMANDS), ("lease", True, 0), ("lease", True, 2)]
     await until(lambda: len(here.publisher.bodies) > 2, "it is repeated")
     assert set(here.publisher.bodies[1:]) == {STOP}
-    assert here.inbound.leases_fired == 1 and caplog.text.count("no fresh command; publishing the stop command") == 1
+    assert (
+        here.inbound.commands.leases_fired == 1
+        and caplog.text.count("no fresh command; publishing the stop command") == 1
+    )
+    here.bridge.close()
+
+
+async def test_with_a_ramp_the_robot_is_slowed_down_and_told_zero_once(caplog: pytest.LogCaptureFixture) -> None:
+    here = Here(ramped(0.001, decelerate=5.0))
+    opened = here.opened(COMMANDS, TWIST)
+    here.message(opened, drive(1.0))
+    await until(lambda: here.inbound.commands.due_s is None, "the robot stands")
+    said = speeds(here.publisher)
+    assert said[0] == 1.0 and said[-1] == 0.0 and said.count(0.0) == 1
+    assert said == sorted(said, reverse=True) and len(said) >= 2
+    assert here.guard.commands == [drive(1.0)] and all(here.guard.slowing)
+    assert caplog.text.count("no fresh command; slowing the robot down") == 1
+    assert here.inbound.commands.leases_fired == 1
+    here.bridge.close()
+    assert speeds(here.publisher) == said, "it stands: there is nothing left to say"
+
+
+async def test_a_robot_whose_operator_leaves_is_slowed_down_as_well() -> None:
+    here = Here(ramped(0.001, decelerate=5.0))
+    opened = here.opened(COMMANDS, TWIST)
+    here.message(opened, drive(1.0))
+    here.bridge.stream_closed(opened)
+    publisher = here.publisher
+    assert not publisher.closed and here.inbound.held[COMMANDS] == 1
+    await until(lambda: publisher.closed, "it stands, and the topic is ended")
+    assert speeds(publisher)[-1] == 0.0 and speeds(publisher).count(0.0) == 1
+    assert here.guard.told[-1][0] == "closed" and here.inbound.held[COMMANDS] == 0
+
+
+async def test_the_next_operator_ends_the_ramp_of_the_last_one() -> None:
+    here = Here(ramped())
+    first = here.opened(COMMANDS, TWIST)
+    here.message(first, drive(1.0))
+    here.bridge.stream_closed(first)
+    before = here.publisher
+    closed = [before.closed]  # its last command still holds
+    second = here.opened(COMMANDS, TWIST)
+    closed.append(before.closed)
+    here.message(second, drive(0.5))
+    assert [*closed, before.closed] == [False, False, True]
+    assert speeds(before) == [1.0] and speeds(here.publisher) == [0.5]
+    here.bridge.close()
+    assert speeds(here.publisher) == [0.5, 0.0] and here.publisher.closed
+
+
+async def test_many_streams_that_end_are_not_kept_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(commands, "MAX_ENDING", 0)
+    here = Here(ramped())
+    opened = here.opened(COMMANDS, TWIST)
+    here.message(opened, drive(1.0))
+    here.bridge.stream_closed(opened)
+    assert speeds(here.publisher) == [1.0, 0.0] and here.publisher.closed
+
+
+async def test_a_command_that_cannot_be_read_is_answered_with_the_stop_command() -> None:
+    here = Here(ramped(0.001))
+    here.message(here.opened(COMMANDS, TWIST), b"go")
+    await until(lambda: here.inbound.commands.due_s is None)
+    assert here.publisher.bodies == [b"go", STOP] and here.guard.commands == [None]
     here.bridge.close()
 
 
@@ -299,7 +385,7 @@ async def test_a_type_that_has_no_stop_command_has_no_lease(
     monkeypatch.setattr(ros_types, "zero_message", lambda _type, _encoding: None)
     here = Here(leased())
     here.message(here.opened(COMMANDS, TWIST), b"go")
-    assert here.inbound.lease_due_s is None and here.guard.told == []
+    assert here.inbound.commands.due_s is None and here.guard.told == []
     assert "on_link_loss cannot stop it; no lease" in caplog.text and here.publisher.bodies == [b"go"]
 
 

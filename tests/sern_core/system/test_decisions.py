@@ -132,7 +132,7 @@ def lease_expired() -> tuple[TraceRecord, ...]:
     assert robot.send(command, b"go")
     world.run(0.1)
     lease = CommandLease(0.5)
-    lease.renew(born_s=site.now - site.on("/robot/cmd")[-1].age_s)
+    lease.renew(born_s=site.now - site.on("/robot/cmd")[-1].age_s, now=site.now)
     while not lease.expired:
         world.run(0.05)
         if lease.due(now=site.now):

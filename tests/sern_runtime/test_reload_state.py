@@ -1,6 +1,6 @@
 """A failed reload stays beside the state until what it could not put in force is in force."""
 
-from sern_relay.reload_state import ReloadState
+from sern_runtime.reload_state import ReloadState
 
 
 def test_a_failure_stays_until_a_file_is_read_and_tells_once_how_long_it_lasted() -> None:
