@@ -153,7 +153,7 @@ class HopAdapter:
         self._probe = RawProbe(params.interval_s)
         self._trial = CapacityTrial(params.interval_s, assumed_min_bps=params.ranges.bandwidth_max_bps)
         self._since_s = now
-        self._wire_bytes = link.observe(now=now).wire_bytes
+        self._wire_bytes = _taken_bytes(link.observe(now=now))
         self._encode_s = self._coder_s()
         self._topics: dict[TopicName, _TopicStats] = {}
         self._arrived: dict[PriorityClass, _ClassCount] = {priority: _ClassCount() for priority in CLASSES}
@@ -170,7 +170,7 @@ class HopAdapter:
     # --- measuring ------------------------------------------------------------------------------------------------
 
     def note_arrival(self, spec: TopicSpec, message: Message, now: float) -> None:
-        if message.replay or message.drop_marker:
+        if message.replay or message.drop_marker or spec.background:
             return
         count = self._arrived[spec.priority]
         latency_s = max(0.0, now - message.born_s - self.link.rtt_s / 2.0)  # the acknowledgement took half a round trip
@@ -211,8 +211,9 @@ class HopAdapter:
         return max(self.params.ranges.bandwidth_max_bps, UNFILLED * (link.bound_bps or 0.0))
 
     def _wanted(self) -> list[TopicView]:
-        """Streams that somebody wants."""
-        return [view for view in self.link.topics() if view.wanted and view.ready]
+        """Streams that somebody wants. What is in the background takes only what these leave: it is no reason to thin
+        them."""
+        return [v for v in self.link.topics() if v.wanted and v.ready and not v.spec.background]
 
     def _count(self, views: Iterable[TopicView]) -> dict[PriorityClass, _ClassCount]:
         """What the interval brought, by class; the arrivals since the last call are in it."""
@@ -309,7 +310,7 @@ class HopAdapter:
         measurement, terms, value = None, None, None
         carried_bps = fmean(self._samples) if self._samples else self._capacity_bps(link)
         if link.established and any(count.offered for count in counts.values()):
-            measurement = self._measure(counts, demands, link.wire_bytes - self._wire_bytes, elapsed_s)
+            measurement = self._measure(counts, demands, _taken_bytes(link) - self._wire_bytes, elapsed_s)
             terms = params.ranges.terms(
                 latency_s=measurement.latency_s,
                 unreliability=measurement.unreliability,
@@ -334,7 +335,7 @@ class HopAdapter:
             levels if items else {},
         )
         self._measured = measurement
-        self._since_s, self._wire_bytes, self._encode_s = now, link.wire_bytes, self._coder_s()
+        self._since_s, self._wire_bytes, self._encode_s = now, _taken_bytes(link), self._coder_s()
         self._samples.clear()
         foreseen = self.last.decision.prediction if self.last is not None else None
         self.prediction_error = None if value is None or foreseen is None else value - foreseen.cost
@@ -401,6 +402,11 @@ def settings(configuration: Configuration, *, encodes: bool) -> LinkSettings:
 def codecs_of(mode: str) -> tuple[Compression, ...]:
     """What the mode z stands for, the better first; which of them a topic takes is up to what it allows."""
     return (*LOSSY, Compression.ZSTD) if mode == LOSSY_MODE else (Compression(mode),)
+
+
+def _taken_bytes(link: LinkView) -> int:
+    """What left so far, but for what took only the room that was over."""
+    return link.wire_bytes - link.background_bytes
 
 
 def _depth(view: TopicView) -> int:

@@ -123,7 +123,9 @@ class Composer:
             served = priority
             grown = self._put(datagram, channel, out, end, now)
             ride = shared and not window_open
-            scheduler.charge(priority, grown, now=now)
+            scheduler.charge(priority, grown, now=now, background=channel.spec.background)
+            if channel.spec.background:
+                self._lanes.background_bytes += grown
             self._outlook.sent(priority, grown, now)
             sender.refresh(channel, now)
             if lane.stalled:

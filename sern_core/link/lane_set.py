@@ -49,6 +49,7 @@ class LaneSet:
         self.priority_lane: Lane | None = None
         """The lane that carries class control beside it, if there is one."""
         self.wire_bytes = 0
+        self.background_bytes = 0  # of those, fragments of streams in the background
         """Bytes of numbered datagrams sent so far, second copies and headers included."""
 
     @property

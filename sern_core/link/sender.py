@@ -196,6 +196,7 @@ class Sender:
             size_bytes=size_bytes,
             since_s=since_s,
             stale_after_s=spec.lifespan_s if self.paper else None,
+            background=spec.background,
         )
 
     def pick(self, now: float, *, window_open: bool) -> int | None:

@@ -71,6 +71,8 @@ class LinkView(NamedTuple):
     """The peer's clock less ours."""
     clock_error_s: float
     """Bound of the error of the offset; inf: not known yet."""
+    background_bytes: int = 0
+    """Bytes of `wire_bytes` that were of streams in the background: the rest of the link, which they take, is free."""
 
     @property
     def up(self) -> bool:
@@ -221,6 +223,7 @@ def observe(end: End, lanes: LaneSet, receiver: Receiver, now: float) -> LinkVie
         strays=receiver.strays,
         clock_offset_s=clock.offset_s,
         clock_error_s=clock.error_s,
+        background_bytes=lanes.background_bytes,
     )
 
 

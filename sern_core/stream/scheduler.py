@@ -12,6 +12,9 @@ urgent message) serves by (class, −P). A class is served ahead of a backlogged
 - when the token bucket of class 0 is spent: class 0 may take `class0_share` of the link while others wait;
 - while the more urgent message is being encoded.
 
+Streams in the background (`TopicSpec.background`) count as class 2 and stand below it: they are served only while
+nothing else waits, and have no floor.
+
 Ordering `paper` is Alg. prioritize as printed: once per interval all pending messages are sorted by P, classes mixed;
 those that fit the interval's budget B·Δt are sent whole, the others wait, and a stale one of the lowest class is
 reported for dropping. A message larger than the budget is therefore never sent. A message that was marked and not
@@ -78,6 +81,7 @@ class _Entry(NamedTuple):
     size_bytes: float
     since_s: float
     stale_after_s: float | None
+    background: bool
 
 
 _new_entry = tuple.__new__  # builds an _Entry in half the time of its constructor; one is built per offer
@@ -152,7 +156,7 @@ class _Interval:
         waiting = [
             (-score(entry, now, self._params), channel_id, entry)
             for channel_id, entry in entries.items()
-            if channel_id not in self.marked
+            if channel_id not in self.marked and not entry.background
         ]
         waiting.sort()
         used_bytes = 0.0
@@ -203,6 +207,7 @@ class Scheduler:
         self._credit_max = CREDIT_QUANTA * quantum_bytes
         self._tables = tuple(PendingClass(eta=params.eta, a_max_s=params.a_max_s, origin_s=now) for _ in CLASSES)
         self._control, self._state, self._bulk = self._tables
+        self._background = PendingClass(eta=params.eta, a_max_s=params.a_max_s, origin_s=now)
         self._entries: dict[int, _Entry] = {}
         self._encoding: dict[int, _Entry] = {}  # withdrawn while encoded: not served, but still backlog of its class
         self._held = [0] * len(CLASSES)  # how many of `_encoding` there are, per class
@@ -222,12 +227,14 @@ class Scheduler:
         size_bytes: float,
         since_s: float,
         stale_after_s: float | None = None,
+        background: bool = False,
     ) -> None:
         """The channel has a pending message: a new head, or less of the same one left to send.
 
         `weight` is κ(t), `size_bytes` the remaining size s(m) (an estimate will do). Age counts from `since_s`: the
         message's birth, or for a coalesced topic the time the topic was last sent; not later than the next `pick`.
         `stale_after_s` (ordering `paper`) is the age above which a message of class bulk may be reported as stale.
+        `background`, the same for a channel's whole life: it is served only while nothing else waits.
         In ordering `paper` an offer with the same `since_s` and no larger size continues the same message.
 
         Raises UsageError if `weight` is not above 0, `size_bytes` is negative, or a value is not finite.
@@ -240,7 +247,14 @@ class Scheduler:
             )
         entries = self._entries
         old = entries.get(channel_id)
-        entries[channel_id] = entry = _new_entry(_Entry, (priority, weight, size_bytes, since_s, stale_after_s))
+        entries[channel_id] = entry = _new_entry(
+            _Entry, (priority, weight, size_bytes, since_s, stale_after_s, background)
+        )
+        if background:
+            self._background.put(channel_id, gain, since_s)
+            if self._encoding:
+                self._release(channel_id)
+            return
         if old is not None and old[0] is not priority:
             self._remove(channel_id, old[0])
         self._tables[priority].put(channel_id, gain, since_s)
@@ -261,12 +275,14 @@ class Scheduler:
         entry = self._entries.pop(channel_id, None)
         if encoding and entry is not None:
             self._encoding[channel_id] = entry
-            self._held[entry.priority] += 1
+            self._held[entry.priority] += not entry.background
         elif self._encoding and not encoding:
             held = self._release(channel_id)
             if held is not None:
                 self._settle_credit(held.priority)
-        if entry is not None:
+        if entry is not None and entry.background:
+            self._background.remove(channel_id)
+        elif entry is not None:
             self._remove(channel_id, entry[0])
         if self._interval is not None:
             self._interval.withdrawn(channel_id, encoding=encoding)
@@ -281,7 +297,7 @@ class Scheduler:
         """The message is no longer being encoded."""
         entry = self._encoding.pop(channel_id, None)
         if entry is not None:
-            self._held[entry.priority] -= 1
+            self._held[entry.priority] -= not entry.background
         return entry
 
     def _settle_credit(self, priority: PriorityClass) -> None:
@@ -293,20 +309,31 @@ class Scheduler:
                 self._bulk_credit = min(self._bulk_credit, 0.0)
 
     def pending(self, priority: PriorityClass) -> int:
-        """Channels of the class that could be served; those being encoded are not counted."""
+        """Channels of the class that could be served; those being encoded, or in the background, are not counted."""
         return len(self._tables[priority].channel_ids)
 
     @property
     def pends(self) -> bool:
         """Whether a channel of any class could be served."""
-        return bool(self._bulk.channel_ids or self._state.channel_ids or self._control.channel_ids)
+        return bool(
+            self._bulk.channel_ids
+            or self._state.channel_ids
+            or self._control.channel_ids
+            or self._background.channel_ids
+        )
+
+    @property
+    def background_only(self) -> bool:
+        """Whether nothing waits but what is in the background."""
+        return bool(self._background.channel_ids) and len(self._background) == len(self._entries)
 
     # Whose turn it is
 
     def pick(self, *, now: float, window_open: bool = True) -> int | None:
         """The channel to serve next, or None. Asking changes nothing: it may be asked again, or not be followed."""
         if self._interval is not None:
-            return self._pick_marked(self._interval, now, window_open=window_open)
+            marked = self._pick_marked(self._interval, now, window_open=window_open)
+            return self._pick_background(now) if marked is None and window_open else marked
         control = self._control
         if control.channel_ids and now >= self._bucket.ready_s:
             if not window_open:
@@ -325,7 +352,13 @@ class Scheduler:
             return self._state.best(now)
         if bulk.channel_ids:
             return bulk.best(now)
-        return control.best(now) if control.channel_ids else None  # spent, but nobody else wants the link
+        if control.channel_ids:
+            return control.best(now)  # spent, but nobody else wants the link
+        return self._pick_background(now)
+
+    def _pick_background(self, now: float) -> int | None:
+        """What may go because nothing else waits."""
+        return self._background.best(now) if self.background_only else None
 
     def pick_control(self, *, now: float, window_open: bool) -> int | None:
         """The channel of class control to serve next on a connection of its own: beyond its share of the link it goes
@@ -353,7 +386,9 @@ class Scheduler:
         state, bulk = self._state, self._bulk
         if bulk.channel_ids and (not state.channel_ids or self._bulk_credit >= self._quantum_bytes):
             return bulk.best(now)
-        return state.best(now) if state.channel_ids else None
+        if state.channel_ids:
+            return state.best(now)
+        return self._pick_background(now)
 
     def _pick_marked(self, interval: _Interval, now: float, *, window_open: bool) -> int | None:
         interval.advance(self._entries, now)
@@ -376,8 +411,11 @@ class Scheduler:
         table = self._tables[priority]
         return table.best(now) if table.channel_ids else None
 
-    def charge(self, priority: PriorityClass, nbytes: int, *, now: float) -> None:
-        """`nbytes` of that class were put on the wire, overhead included, whether or not `pick` had named it."""
+    def charge(self, priority: PriorityClass, nbytes: int, *, now: float, background: bool = False) -> None:
+        """`nbytes` of that class were put on the wire, overhead included, whether or not `pick` had named it. What is
+        in the background pays nothing and earns nobody anything: nobody waited for it."""
+        if background:
+            return
         bucket = self._bucket
         if priority == 0:
             urgent_waits = True
@@ -434,7 +472,7 @@ class Scheduler:
         if interval is None:
             return self._bucket.ready_s if self._control.channel_ids else None
         deadline = None
-        if any(channel_id not in interval.marked for channel_id in self._entries):
+        if any(channel_id not in interval.marked for channel_id, e in self._entries.items() if not e.background):
             deadline = interval.next_s
         if any(
             self._entries[channel_id].priority == 0 for channel_id in interval.marked if channel_id in self._entries
@@ -515,6 +553,8 @@ class Scheduler:
     ) -> WaitReason | None:
         if chosen == channel_id:
             return None
+        if entry.background:
+            return WaitReason.WINDOW if chosen is None else self._behind(chosen)
         if self._interval is not None and channel_id not in self._interval.marked:
             return WaitReason.INTERVAL
         spent = entry.priority == 0 and now < self._bucket.ready_s
@@ -531,17 +571,20 @@ class Scheduler:
             return WaitReason.CLASS
         return WaitReason.BUCKET if spent else WaitReason.FLOOR
 
+    def _behind(self, chosen: int) -> WaitReason:
+        return WaitReason.OUTRANKED if self._entries[chosen].background else WaitReason.CLASS
+
     def validate(self) -> None:
         """Raise AssertionError unless the parts agree; for test teardown."""
-        for table in self._tables:
+        for table in (*self._tables, self._background):
             table.validate()
         assert not self._entries.keys() & self._encoding.keys()
-        assert self._held == [sum(entry.priority == c for entry in self._encoding.values()) for c in CLASSES]
-        assert sum(len(table.channel_ids) for table in self._tables) == len(self._entries)
+        held = [entry for entry in self._encoding.values() if not entry.background]
+        assert self._held == [sum(entry.priority == c for entry in held) for c in CLASSES]
+        assert sum(len(table.channel_ids) for table in (*self._tables, self._background)) == len(self._entries)
         for channel_id, entry in self._entries.items():
-            assert channel_id in self._tables[entry.priority].channel_ids, (
-                f"channel {channel_id} is not in the table of its class"
-            )
+            table = self._background if entry.background else self._tables[entry.priority]
+            assert channel_id in table.channel_ids, f"channel {channel_id} is not in the table of its class"
         for priority, credit in ((PriorityClass.STATE, self._state_credit), (PriorityClass.BULK, self._bulk_credit)):
             assert credit <= self._credit_max
             backlog = self._tables[priority].channel_ids or self._held[priority]

@@ -50,6 +50,7 @@ class TopicSpec:
     max_queue_bytes: int = DEFAULT_RELIABLE_QUEUE_BYTES
     many_writers: bool = False  # several clients may own this global name, e.g. /tf
     durable: bool = False  # reliable, and kept on disk until it is delivered
+    background: bool = False  # of class bulk, and sent only while nothing else waits
     compression: Compression | None = None  # None: whatever is quickest; for the origin alone, never on the wire
     lossy: tuple[Compression, ...] = ()  # modes that may lose something; for the origin alone
     lossy_params: LossyParams = DEFAULT_LOSSY

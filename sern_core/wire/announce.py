@@ -79,11 +79,13 @@ def encode_announcement(announcement: Announcement) -> framing.Envelope:
         "ret": spec.retention_s,
         "mw": spec.many_writers,
         "kept": spec.durable,
+        "bg": spec.background,
         "attr": dict(stream.attributes),
         "more": announcement.more,
     }
-    if not spec.durable:  # who does not know the word need not see it
-        del envelope["kept"]
+    for word in ("kept", "bg"):  # who does not know the word need not see it
+        if not envelope[word]:
+            del envelope[word]
     while envelope["owed"] and framing.envelope_bytes(envelope) > framing.MAX_ENVELOPE_BYTES:
         envelope["owed"].pop()
     return envelope
@@ -157,9 +159,12 @@ def decode_announcement(envelope: framing.Envelope) -> Announcement:
         retention_s=retention_s,
         many_writers=framing.take_bool(envelope, "mw"),
         durable=framing.take_bool(envelope, "kept"),
+        background=framing.take_bool(envelope, "bg"),
     )
     if spec.durable and not spec.reliable:
         raise WireError("a stream that is kept on disk is reliable")
+    if spec.background and spec.priority is not PriorityClass.BULK:
+        raise WireError("a stream in the background is of class bulk")
     info = TopicInfo(
         name=topic,
         type_name=framing.take_str(envelope, "type", max_length=NAME_MAX_CHARS),

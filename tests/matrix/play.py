@@ -48,14 +48,14 @@ class Audited(Scheduler):
         self.ahead_bytes = [0] * len(CLASS_LABELS)
         self.largest_bytes = 0
 
-    def charge(self, priority: PriorityClass, nbytes: int, *, now: float) -> None:
+    def charge(self, priority: PriorityClass, nbytes: int, *, now: float, background: bool = False) -> None:
         self.total_bytes += nbytes
         self.largest_bytes = max(self.largest_bytes, nbytes)
         waits = bool(self.pending(PriorityClass.CONTROL)) and self.class0_tokens_bytes(now=now) >= 0.0
         waits |= priority is PriorityClass.BULK and bool(self.pending(PriorityClass.STATE))
         if waits and priority is not PriorityClass.CONTROL:
             self.ahead_bytes[priority] += nbytes
-        super().charge(priority, nbytes, now=now)
+        super().charge(priority, nbytes, now=now, background=background)
 
     def broken(self, name: str) -> list[str]:
         """A floor is a share of all that is sent, saved up at most to the credit's limit, and one fragment over."""

@@ -271,3 +271,27 @@ def test_policies_that_choose_no_level_leave_them_alone() -> None:
     r.world.run(5.0)
     assert items[0].changes == []
     assert step_json(r.steps[-1])["chosen"]["summaries"] is None
+
+
+def test_what_is_in_the_background_is_no_reason_to_thin_anything() -> None:
+    """It fills whatever the others leave of the link; they are treated as if it were not there."""
+    chosen = []
+    for fills in (False, True):
+        r = rig(model=LinkModel(rate_bps=4e6, delay_s=0.025))
+        pose = r.robot.publish("/robot/pose", spec(CONTROL, lifespan_s=1.0))
+        cloud = r.robot.publish("/robot/points", spec(BULK, lifespan_s=1.0))
+        fetched = replace(spec(BULK, reliable=True, depth=1000, max_queue_bytes=2**30), background=True)
+        kept = r.robot.publish("/robot/kept", fetched)
+        r.feed(pose, 50.0, 120)
+        r.feed(cloud, 5.0, 20_000)
+        if fills:
+            r.feed(kept, 20.0, 30_000)  # 4.8 Mbit/s
+        r.world.run(20.0)
+        last = r.steps[-1]
+        chosen.append((last.decision.chosen, cloud.thinned))
+        offered = {demand.priority: demand.rate_hz for demand in last.situation.classes}
+        assert offered[BULK] == pytest.approx(5.0, rel=0.05)
+        assert last.measurement is not None and not last.measurement.saturated
+        assert bool(r.site.on("/robot/kept")) is fills
+        r.world.validate()
+    assert chosen[0] == chosen[1]

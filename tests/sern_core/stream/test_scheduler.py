@@ -11,7 +11,7 @@ from sern_core.stream.pending import FEW, PendingClass
 from sern_core.stream.scheduler import BURST_BYTES, CREDIT_QUANTA, DEFAULT_QUANTUM_BYTES, Scheduler, WaitReason
 from sern_core.vocabulary.errors import UsageError
 from sern_core.vocabulary.params import SchedulerParams
-from sern_core.vocabulary.types import CLASSES, PriorityClass
+from sern_core.vocabulary.types import CLASSES, Ordering, PriorityClass
 from tests.exploring import cases
 
 CONTROL, STATE, BULK = CLASSES
@@ -492,3 +492,69 @@ def test_clip_times_do_not_pile_up() -> None:
     table.validate()
     assert table._lines is not None
     assert len(table._lines._clips) <= 64 + 4 * 100
+
+
+# In the background
+
+
+def in_background(scheduler: Scheduler, channel_id: int = 9) -> None:
+    scheduler.offer(channel_id, priority=BULK, weight=1e6, size_bytes=10.0, since_s=T0 - 100.0, background=True)
+
+
+@pytest.mark.parametrize("priority", CLASSES)
+def test_what_is_in_the_background_waits_for_every_class(priority: PriorityClass) -> None:
+    """However light, old and weighty it is, and however heavy the other."""
+    scheduler = Scheduler(SchedulerParams(), now=T0)
+    in_background(scheduler)
+    assert scheduler.pick(now=T0) == scheduler.pick_rest(now=T0) == 9
+    offer(scheduler, 1, priority, 1e6)
+    assert scheduler.pick(now=T0) == 1
+    assert scheduler.waits_for(9, T0) == (WaitReason.CLASS, 1)
+    scheduler.withdraw(1)
+    assert scheduler.pick(now=T0) == 9
+    assert scheduler.pick(now=T0, window_open=False) is None
+    assert scheduler.waits_for(9, T0, window_open=False) == (WaitReason.WINDOW, None)
+    scheduler.validate()
+
+
+def test_what_is_in_the_background_has_no_floor() -> None:
+    """Class state has more than the link carries: class bulk gets its tenth, the background nothing."""
+    scheduler = Scheduler(SchedulerParams(floor=0.1), now=T0)
+    in_background(scheduler)
+    traffic = Traffic(scheduler, 1e6)
+    traffic.run(2000, {1: 1200, 2: 1200}, {1: STATE, 2: BULK})
+    assert 9 not in traffic.order
+    assert traffic.share(2) == pytest.approx(0.1, abs=0.02)
+
+
+def test_what_the_background_sends_costs_and_earns_nobody_anything() -> None:
+    scheduler = Scheduler(SchedulerParams(class0_share=0.5, floor=0.1), now=T0)
+    scheduler.set_rate(1e6, now=T0)
+    in_background(scheduler)
+    before = scheduler.class0_tokens_bytes(now=T0)
+    for _ in range(100):
+        scheduler.charge(BULK, FRAGMENT_BYTES, now=T0, background=True)
+    assert scheduler.class0_tokens_bytes(now=T0) == before
+    offer(scheduler, 1, STATE, 1200)
+    offer(scheduler, 2, BULK, 1200)
+    assert scheduler.pick(now=T0) == 1
+    scheduler.validate()
+
+
+def test_the_background_waits_while_it_is_encoded_and_under_ordering_paper() -> None:
+    scheduler = Scheduler(SchedulerParams(), now=T0)
+    in_background(scheduler)
+    scheduler.withdraw(9, encoding=True)
+    scheduler.validate()
+    assert scheduler.pick(now=T0) is None
+    in_background(scheduler)
+    scheduler.validate()
+    assert scheduler.pick(now=T0) == 9
+    paper = Scheduler(SchedulerParams(ordering=Ordering.PAPER), now=T0)
+    in_background(paper)
+    assert paper.pick(now=T0) == 9
+    offer(paper, 1, BULK, 1200)
+    assert paper.pick(now=T0 + 1.0) == 1
+    paper.withdraw(1)
+    assert paper.pick(now=T0 + 1.0) == 9
+    paper.validate()

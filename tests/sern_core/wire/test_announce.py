@@ -39,8 +39,9 @@ TIMES = st.floats(0.0, MAX_TIME_S)
 @st.composite
 def announcements(draw: st.DrawFn) -> Announcement:
     reliable, latched = draw(st.booleans()), draw(st.booleans())
+    priority = draw(st.sampled_from(PriorityClass))
     spec = TopicSpec(
-        priority=draw(st.sampled_from(PriorityClass)),
+        priority=priority,
         weight=draw(st.floats(1e-9, 1e9)),
         reliability=Reliability.RELIABLE if reliable else Reliability.BEST_EFFORT,
         durability=Durability.TRANSIENT_LOCAL if latched else Durability.VOLATILE,
@@ -49,6 +50,7 @@ def announcements(draw: st.DrawFn) -> Announcement:
         deadline_s=draw(st.none() | TIMES),
         retention_s=draw(TIMES),
         many_writers=draw(st.booleans()),
+        background=priority is PriorityClass.BULK and draw(st.booleans()),
     )
     topic = TopicName(draw(TOPICS))
     info = TopicInfo(
