@@ -462,12 +462,7 @@ class ClientDaemon:
             operating=self.operating,
         )
         register_client(metrics, counting)
-        metrics.counter(
-            "sern_http_refused_total",
-            "Requests to the HTTP server that were none.",
-            read=lambda: [((), float(self._http.refused if self._http else 0))],
-        )
-        return HttpServer(
+        server = HttpServer(
             listen,
             registry,
             health=lambda: Health(ok=True, reason="running"),
@@ -479,8 +474,11 @@ class ClientDaemon:
                 **({} if adaptation is None else {"/api/mmcf": adaptation.view()}),
                 **(self.site.endpoint.json_routes if isinstance(self.site.endpoint, ServedEndpoint) else {}),
             },
+            access=self.loaded.model.http.access(self.loaded.path.parent),
             parts=self.parts,
         )
+        server.register(metrics)
+        return server
 
     def link_words(self) -> str:
         """How the link is, for people: /readyz with the time there and back."""

@@ -405,9 +405,7 @@ class RelayDaemon:
         registry = CollectorRegistry()
         metrics = Metrics(registry)
         register_relay(metrics, self)
-        metrics.counter("sern_http_refused_total", "Requests to the HTTP server that were none.",
-                        read=lambda: [((), float(self._http.refused if self._http else 0))])  # fmt: skip
-        return HttpServer(
+        server = HttpServer(
             listen,
             registry,
             health=lambda: Health(ok=True, reason="running"),
@@ -416,8 +414,11 @@ class RelayDaemon:
                 **self.views.routes(self.adaptation),
                 "/api/keys": lambda: {} if self.keyring is None else self.keyring.to_json(),
             },
+            access=self.loaded.model.http.access(self.loaded.path.parent),
             parts=self.parts,
         )
+        server.register(metrics)
+        return server
 
     def _make_feed(self, ctx: "zmq.Context[zmq.Socket[bytes]]", roles: tuple[FeedRole, ...]) -> RelayFeed:
         return RelayFeed(ctx, self.hub, roles, after=self._after, refused=self.refused)

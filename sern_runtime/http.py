@@ -1,4 +1,7 @@
-"""The daemon's small HTTP server: /metrics, /healthz, /readyz and JSON for the tools. Read-only."""
+"""The daemon's small HTTP server: /metrics, /healthz, /readyz, JSON for the tools, and the page. Read-only.
+
+Who may ask is `http_access`'s to say; a refusal is one line of text.
+"""
 
 import asyncio
 import errno
@@ -13,8 +16,9 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import choose_encoder
 
 from sern_core.vocabulary.errors import ConfigError, UsageError
+from sern_runtime.http_access import HttpAccess
 from sern_runtime.http_routes import HealthCheck, JsonParts, JsonQuery, JsonSource, UnknownError
-from sern_runtime.metrics import exposition
+from sern_runtime.metrics import Metrics, exposition
 from sern_runtime.optional import OptionalParts
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
@@ -26,6 +30,7 @@ MAX_ANSWER_BYTES: Final = 64 * 2**20
 SLICE_PIECES: Final = 100
 SLICE_BYTES: Final = 2**18
 """Pieces and bytes of a large answer that are made in one turn of the loop: about 5 ms."""
+HEALTH: Final = ("/healthz", "/readyz")
 PART: Final = "http"
 _log = logging.getLogger(__name__)
 
@@ -69,7 +74,8 @@ class HttpServer:
     """Serves while started. `start` and `stop` once each; `stop` also after a failed `start`.
 
     `health` says whether the process works (a supervisor restarts it otherwise), `ready` whether it does its job now.
-    `json_routes` maps paths, such as /api/link, to what gives their content.
+    `json_routes` maps paths, such as /api/link, to what gives their content. `access`: who may ask; None: whoever is on
+    this machine.
     """
 
     def __init__(
@@ -80,9 +86,12 @@ class HttpServer:
         health: HealthCheck,
         ready: HealthCheck,
         json_routes: Mapping[str, JsonSource | JsonQuery] | None = None,
+        access: HttpAccess | None = None,
         parts: OptionalParts | None = None,
         idle_s: float = IDLE_S,
     ) -> None:
+        self._access = access or HttpAccess()
+        self._access.let_in(*HEALTH)  # supervisors have no token
         self._idle_s = idle_s
         self._parts = parts or OptionalParts(PART)
         self.listen = listen
@@ -91,18 +100,40 @@ class HttpServer:
         self._runner: web.AppRunner | None = None
         self._requests = _RequestLog()
         self._scraping = asyncio.Lock()
-        self._app = web.Application(middlewares=[self._survive])
+        self._app = web.Application(middlewares=[self._survive, self._admit])
         self._app.router.add_get("/metrics", self._metrics)
-        self._app.router.add_get("/healthz", _health_route(health))
-        self._app.router.add_get("/readyz", _health_route(ready))
+        self._app.router.add_get(HEALTH[0], _health_route(health))
+        self._app.router.add_get(HEALTH[1], _health_route(ready))
         for path, source in (json_routes or {}).items():
             self.add_json(path, source)
 
     def add_json(self, path: str, source: JsonSource | JsonQuery) -> None:
         """Add a JSON route. Before `start`."""
+        self._router.add_get(path, _json_route(source))
+
+    def add(self, path: str, handler: Handler) -> None:
+        """Add a route for GET alone. Before `start`."""
+        self._router.add_get(path, handler, allow_head=False)
+
+    @property
+    def _router(self) -> web.UrlDispatcher:
         if self._runner is not None:
             raise UsageError("routes are added before the server is started")
-        self._app.router.add_get(path, _json_route(source))
+        return self._app.router
+
+    def register(self, metrics: Metrics) -> None:
+        """What this server counts."""
+        metrics.counter(
+            "sern_http_refused_total",
+            "Requests to the HTTP server that were none.",
+            read=lambda: [((), float(self._requests.refused))],
+        )
+        metrics.counter(
+            "sern_http_unauthorized_total",
+            "Requests to the HTTP server without the token, or by a name where there is no token.",
+            ("reason",),
+            lambda: [((reason,), float(count)) for reason, count in self._access.refused.items()],
+        )
 
     @property
     def port(self) -> int:
@@ -152,6 +183,16 @@ class HttpServer:
             if request.path.startswith("/api/"):
                 return web.json_response({"error": text}, status=500)
             return web.Response(status=500, text=text + "\n")
+
+    @web.middleware
+    async def _admit(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Who may not ask gets a line in place of an answer."""
+        headers = request.headers
+        refusal = self._access.refusal(request.path, headers.get("Host"), headers.get("Authorization"))
+        if refusal is None:
+            return await handler(request)
+        asks = {"WWW-Authenticate": 'Bearer realm="sern"'} if refusal.status == 401 else {}
+        return web.Response(status=refusal.status, text=refusal.text + "\n", headers=asks)
 
     async def _metrics(self, request: web.Request) -> web.Response:
         encode, content_type = choose_encoder(request.headers.get("Accept", ""))

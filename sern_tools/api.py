@@ -11,14 +11,18 @@ import sys
 import urllib.error
 import urllib.request
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
 
 from sern_core.vocabulary.errors import ConfigError, SernError, UsageError
+from sern_runtime.config.tokens import read_token
 from sern_runtime.entry import EXIT_CONFIG, EXIT_FAILED
 
 LOCAL_APIS: Final = tuple(f"http://127.0.0.1:{port}" for port in (5580, 5581, 5582))
 """Where the daemons of the examples answer: relay, robot, site."""
+TOKEN_VARIABLE: Final = "SERN_TOKEN_FILE"
+"""The environment variable with the file whose token is sent: `http.token_file` of the daemon that is asked."""
 PROBED: Final = "/api/link"
 PROBE_S: Final = 1.0
 TIMEOUT_S: Final = 5.0
@@ -37,6 +41,10 @@ class NotFoundError(SernError):
 
 class UnknownError(SernError):
     """The daemon has the path, and not what was asked for there; its own words say what it has."""
+
+
+class DeniedError(SernError):
+    """The daemon asks for a token, and got none or another."""
 
 
 def checked_api(api: str) -> str:
@@ -59,6 +67,8 @@ def local_api(apis: Sequence[str] | None = None) -> str:
     for api in apis:
         try:
             get_json(api, PROBED, timeout_s=PROBE_S)
+        except (ConfigError, DeniedError):
+            raise
         except SilentError:
             silent.append(api.removeprefix("http://"))
         except SernError:
@@ -82,15 +92,19 @@ def _hung(addresses: list[str]) -> str:
 
 def get_json(api: str, path: str, *, timeout_s: float | None = None) -> Any:
     """The JSON at `path` of the daemon at `api`. Raises NotFoundError for a path it lacks, UnknownError and UsageError
-    in the daemon's words for what it does not have or take there, else SernError.
+    in the daemon's words for what it does not have or take there, DeniedError where it wants another token, ConfigError
+    for a token that cannot be read, else SernError.
 
     `timeout_s`: how long it may be silent; None: `TIMEOUT_S`.
     """
     try:
-        with _opener.open(api + path, timeout=TIMEOUT_S if timeout_s is None else timeout_s) as answer:
+        request = urllib.request.Request(api + path, headers=_authorization())
+        with _opener.open(request, timeout=TIMEOUT_S if timeout_s is None else timeout_s) as answer:
             return json.load(answer)
     except urllib.error.HTTPError as error:
         with error:
+            if error.code == 401:
+                raise DeniedError(_denied(api)) from None
             said = _said(error)
             if error.code == 404:
                 if said:
@@ -108,6 +122,24 @@ def get_json(api: str, path: str, *, timeout_s: float | None = None) -> Any:
         raise SilentError(f"{api}{path}: no answer in time; it hangs, or is no SERN daemon") from None
     except (OSError, http.client.HTTPException, ValueError):
         raise SernError(f"{api}{path}: the answer is not JSON; is this a SERN daemon?") from None
+
+
+def _authorization() -> dict[str, str]:
+    """The header with the token, where the environment names a file with one. Raises ConfigError."""
+    name = os.environ.get(TOKEN_VARIABLE)
+    if not name:
+        return {}
+    try:
+        return {"Authorization": f"Bearer {read_token(Path(name))}"}
+    except ConfigError as error:
+        raise ConfigError(f"{TOKEN_VARIABLE}: {error}") from None
+
+
+def _denied(api: str) -> str:
+    name = os.environ.get(TOKEN_VARIABLE)
+    if not name:
+        return f"{api} asks for a token: put the file of its http.token_file into {TOKEN_VARIABLE}"
+    return f"{api} does not take the token in {name} ({TOKEN_VARIABLE}); it must be that of its http.token_file"
 
 
 def _said(error: urllib.error.HTTPError) -> str:

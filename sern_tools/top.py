@@ -1,7 +1,8 @@
 """`sern top`: a daemon on one screen: its link, its configuration, and each topic with what is wrong with it.
 
 It is made to be read over SSH at 80 columns: what is wrong is in colour and in words, and comes before what is well.
-`top_state` reads the daemon's answers, `top_why` finds the words, `top_text` makes the lines; all three are pure.
+`watching.state` of the runtime reads the daemon's answers and `watching.why` finds the words, both also for the page
+that a daemon serves; `top_text` makes the lines. All three are pure.
 """
 
 import json
@@ -16,11 +17,11 @@ from typing import Annotated, Any, Final, TextIO
 import typer
 
 from sern_core.vocabulary.errors import SernError
+from sern_runtime.watching.state import EVENTS, Sample, View, read
+from sern_runtime.watching.why import view
 from sern_tools.api import NotFoundError, checked_api, drop_output, get_json, local_api, say
 from sern_tools.terminal import EndedError, Terminal
-from sern_tools.top_state import EVENTS, Sample, View, read
 from sern_tools.top_text import in_colour, screen
-from sern_tools.top_why import view
 from sern_tools.topics import MIN_INTERVAL_S
 
 PLAIN_WIDTH: Final = 100

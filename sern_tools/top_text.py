@@ -9,8 +9,8 @@ import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
+from sern_runtime.watching.state import LinkLine, TopicLine, View, class_order
 from sern_tools.explain_story import rate
-from sern_tools.top_state import LinkLine, TopicLine, View, class_order
 
 MIN_WIDTH: Final = 20
 """What is laid out for less is cut."""

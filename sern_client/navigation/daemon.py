@@ -162,14 +162,17 @@ class NavigationDaemon:
         register_navigation(metrics, self.node, self.perception)
         self.errors.register(metrics)
         self.parts.register(metrics)
-        return HttpServer(
+        server = HttpServer(
             listen,
             registry,
             health=lambda: Health(ok=True, reason="running"),
             ready=self.readiness,
             json_routes={"/api/navigation": self.node.to_json},
+            access=self.loaded.model.http.access(self.loaded.path.parent),
             parts=self.parts,
         )
+        server.register(metrics)
+        return server
 
     def readiness(self) -> Health:
         """What `/readyz` says: whether a goal would be driven to."""

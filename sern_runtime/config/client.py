@@ -621,6 +621,7 @@ class ClientFile(FileModel):
 
     def file_problems(self, base_dir: Path) -> Iterator[FileProblem]:
         yield from socket_problems(base_dir, self.relay.endpoint, ("relay", "endpoint"))
+        yield from self.http.problems(base_dir)
         if self.scene is not None:
             yield from self.scene.file_problems(base_dir, ("scene",))
         if self.relay.server_key_file is not None:

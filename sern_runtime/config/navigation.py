@@ -302,6 +302,7 @@ class NavigationFile(FileModel):
         several = isinstance(self.endpoint, tuple)
         for index, endpoint in enumerate(self.endpoints):
             yield from endpoint.file_problems(base_dir, ("endpoint", index) if several else ("endpoint",))
+        yield from self.http.problems(base_dir)
         yield from missing_directories(base_dir, self.type_paths, ("type_paths",))
         perception = self.perception
         if perception is not None and perception.model is not None:

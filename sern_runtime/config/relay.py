@@ -45,6 +45,7 @@ from sern_runtime.config.load import Loaded, load
 from sern_runtime.config.shared import (
     ClassWord,
     DurableSection,
+    HttpSection,
     LinkSection,
     LogSection,
     SchedulerSection,
@@ -109,11 +110,11 @@ class RelaySection(Section):
         return self
 
 
-class RelayHttpSection(Section):
-    """The HTTP server with /metrics, /healthz and /readyz."""
+class RelayHttpSection(HttpSection):
+    """The HTTP server with the page to watch it by, /metrics, /healthz and /readyz."""
 
     listen: HttpListen | None = DEFAULT_HTTP_LISTEN
-    """`address:port`; null: no HTTP server. It has no access control: keep it on loopback or behind a proxy."""
+    """`address:port`; null: no HTTP server. Beyond loopback `token_file` is needed."""
 
 
 class AccessSection(Section):
@@ -375,6 +376,7 @@ class RelayFile(FileModel):
         for index, section in enumerate(self.feed.roles):
             for key in _SOCKETS:
                 yield from socket_problems(base_dir, getattr(section, key), ("feed", "roles", index, key))
+        yield from self.http.problems(base_dir)
         yield from self._rule_problems()
         yield from output_problems(base_dir, self.message_log, ("message_log",))
         yield from output_problems(base_dir, self.summary, ("summary",))

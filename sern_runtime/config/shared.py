@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from enum import StrEnum
 from math import inf
 from pathlib import Path
-from typing import Annotated, Final, Literal, get_args
+from typing import Annotated, Final, Literal, Self, get_args
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.params import LinkParams, Redundancy, SchedulerParams, WindowAlgorithm, WindowParams
@@ -22,14 +22,18 @@ from sern_runtime.config.base import (
     SecondsOrZero,
     Section,
     described,
+    fault,
+    is_local,
     resolve,
     unit_makes,
     unit_problems,
 )
 from sern_runtime.config.keys import PUBLIC_SUFFIX, load_public, load_secret, load_server_keys, secret_warning
+from sern_runtime.config.tokens import read_token, token_problems
 from sern_runtime.config.yaml import Loc
 from sern_runtime.dscp import DSCP_NAMES, Marks
 from sern_runtime.durable.names import DURABLE_FILE
+from sern_runtime.http_access import HttpAccess
 
 ClassWord = Literal["control", "state", "bulk"]
 DscpName = Literal[
@@ -158,10 +162,34 @@ class LinkSection(Section):
 
 
 class HttpSection(Section):
-    """The HTTP server with /metrics, /healthz and /readyz."""
+    """The HTTP server with the page to watch it by, /metrics, /healthz and /readyz."""
 
     listen: HttpListen | None = None
-    """`address:port`, such as 127.0.0.1:5581; null: no HTTP server. It has no access control: keep it on loopback."""
+    """`address:port`, such as 127.0.0.1:5581; null: no HTTP server. Beyond loopback `token_file` is needed."""
+    token_file: PathText | None = None
+    """A file with one line, the token that whoever asks must send (`Authorization: Bearer TOKEN`) for all but /healthz
+    and /readyz; null: whoever is on this machine may ask. Nothing is encrypted: beyond loopback use a private network,
+    or a proxy with TLS."""
+
+    @model_validator(mode="after")
+    def _is_closed(self) -> Self:
+        listen = self.listen
+        if listen is not None and self.token_file is None and not is_local(f"tcp://{listen}"):
+            raise fault(
+                f"{listen} is open to the network: set http.token_file, or listen on 127.0.0.1 and come through an SSH "
+                "tunnel (ssh -L)",
+                "listen",
+            )
+        return self
+
+    def problems(self, base_dir: Path) -> Iterator[FileProblem]:
+        """Problems of the token's file, as the whole file's own."""
+        return token_problems(base_dir, self.token_file, ("http", "token_file"))
+
+    def access(self, base_dir: Path) -> HttpAccess:
+        """Who may ask. Raises ConfigError when the token cannot be read."""
+        token = None if self.token_file is None else read_token(resolve(base_dir, self.token_file))
+        return HttpAccess(token)
 
 
 class LogLevel(StrEnum):

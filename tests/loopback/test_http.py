@@ -12,6 +12,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_runtime.http import IDLE_S, HttpServer, parse_listen
+from sern_runtime.http_access import HttpAccess
 from sern_runtime.http_routes import Health
 from sern_runtime.metrics import Metrics
 from tests.support import until
@@ -20,7 +21,9 @@ from tests.support import until
 class Daemon:
     """A server and what it is asked about."""
 
-    def __init__(self, listen: str = "127.0.0.1:0", *, idle_s: float = IDLE_S) -> None:
+    def __init__(
+        self, listen: str = "127.0.0.1:0", *, idle_s: float = IDLE_S, access: HttpAccess | None = None
+    ) -> None:
         self.registry = CollectorRegistry()
         self.metrics = Metrics(self.registry, process=False)
         self.health = Health(ok=True, reason="ok")
@@ -34,8 +37,10 @@ class Daemon:
                 "/api/link": lambda: {"up": True, "rtt_s": 0.025},
                 "/api/broken": lambda: dict[str, int]()["no such key"],
             },
+            access=access,
             idle_s=idle_s,
         )
+        self.server.register(self.metrics)
 
     async def get(self, path: str, **headers: str) -> tuple[int, str, str]:
         async with (
@@ -86,6 +91,32 @@ async def test_json_and_a_view_that_fails(caplog: pytest.LogCaptureFixture) -> N
     with pytest.raises(UsageError, match="before the server is started"):
         daemon.server.add_json("/late", dict)
     await daemon.server.stop()
+    await daemon.server.stop()
+
+
+async def test_who_has_no_token_gets_a_line_and_is_counted() -> None:
+    token = "0123456789abcdef"
+    daemon = Daemon(access=HttpAccess(token))
+    await daemon.server.start()
+    for path in ("/api/link", "/metrics", "/nothing"):
+        status, kind, text = await daemon.get(path, Authorization=f"Bearer {token}x")
+        assert (status, kind) == (401, "text/plain")
+        assert text == "this is not the token; send Authorization: Bearer TOKEN, as http.token_file has it\n"
+        assert (await daemon.get(path))[2].startswith("a token is needed; ")
+    assert (await daemon.get("/healthz"))[0] == 200
+    assert (await daemon.get("/api/link", Authorization=f"Bearer {token}"))[0] == 200
+    _status, _kind, text = await daemon.get("/metrics", Authorization=f"Bearer {token}")
+    assert 'sern_http_unauthorized_total{reason="token"} 6.0' in text
+    assert 'sern_http_unauthorized_total{reason="host"} 0.0' in text
+    await daemon.server.stop()
+
+
+async def test_a_page_elsewhere_whose_name_is_made_to_stand_for_this_machine_reads_nothing() -> None:
+    daemon = Daemon()
+    await daemon.server.start()
+    for path in ("/api/link", "/metrics"):
+        assert (await daemon.get(path, Host="attacker.example"))[0] == 421
+        assert (await daemon.get(path, Host="localhost:5580"))[0] == 200
     await daemon.server.stop()
 
 

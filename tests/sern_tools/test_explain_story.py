@@ -6,8 +6,9 @@ import pytest
 
 from sern_core.vocabulary.trace import LINK, DecisionTrace, HoldReason, TraceEvent
 from sern_core.vocabulary.types import DropReason, TopicName
+from sern_runtime.watching.words import DROPS
 from sern_tools.explain import story
-from sern_tools.explain_story import ADVICE, DROPS, NAMES, advice, held_because, in_short, lines, verdict
+from sern_tools.explain_story import ADVICE, NAMES, advice, held_because, in_short, lines, verdict
 
 SCAN = TopicName("/scan")
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sern_tools.top_state import Choice, LinkLine, TopicLine, View
+from sern_runtime.watching.state import Choice, LinkLine, TopicLine, View
 from sern_tools.top_text import Line, ago, count, fit, fit_end, in_colour, length, plain, screen, whole
 from tests.exploring import cases
 

@@ -14,7 +14,7 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from sern_core.topics.patterns import compile_pattern
-from sern_core.vocabulary.errors import SernError, UsageError
+from sern_core.vocabulary.errors import ConfigError, SernError, UsageError
 from sern_tools import api
 from sern_tools.commands import app
 from sern_tools.ports import free_ports
@@ -196,6 +196,9 @@ class Stub(BaseHTTPRequestHandler):
         if self.path in ("/api/trace?topic=/x", "/api/trace?tipoc=/x"):
             status = 404 if "topic" in self.path else 400
             body = b'{"error": "topic is not known here; known: /y"}'
+        if self.path == "/api/guarded":
+            status = 200 if self.headers["Authorization"] == "Bearer 0123456789abcdef" else 401
+            body = b"{}" if status == 200 else b"a token is needed"
         self.send_response(status)
         self.end_headers()
         self.wfile.write(body or b"")
@@ -226,6 +229,26 @@ def test_what_a_daemon_may_answer(stub: str, monkeypatch: pytest.MonkeyPatch) ->
     ):
         with pytest.raises(error, match=words):
             api.get_json(stub, path)
+
+
+def test_the_token_of_a_daemon_comes_from_a_file_that_the_environment_names(
+    stub: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(api.TOKEN_VARIABLE, raising=False)
+    monkeypatch.setattr(api, "LOCAL_APIS", (stub,))
+    monkeypatch.setattr(api, "PROBED", "/api/guarded")
+    with pytest.raises(api.DeniedError, match=rf"{stub} asks for a token: put the file of its http.token_file into "):
+        api.local_api()
+    file = tmp_path / "http.token"
+    monkeypatch.setenv(api.TOKEN_VARIABLE, str(file))
+    with pytest.raises(ConfigError, match=r"SERN_TOKEN_FILE: .*http.token: no such file or directory"):
+        api.local_api()
+    file.write_text("fedcba9876543210\n")
+    with pytest.raises(api.DeniedError, match=rf"{stub} does not take the token in {file} \(SERN_TOKEN_FILE\)"):
+        api.local_api()
+    file.write_text("0123456789abcdef\n")
+    assert api.local_api() == stub
+    assert api.get_json(stub, "/api/guarded") == {}
 
 
 @pytest.mark.parametrize("others", ["answers", "nobody"])

@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from sern_tools.top_state import Sample, TopicLine, View, in_words, read
-from sern_tools.top_why import BAD, NOTE, OK, WARN, literal, view
+from sern_runtime.watching.state import Sample, TopicLine, View, in_words, read
+from sern_runtime.watching.why import BAD, NOTE, OK, WARN, literal, view
 
 Json = dict[str, Any]
 

@@ -1,16 +1,15 @@
-"""Why a topic is missing, or less of it is there than was published, in words for `sern top`. Pure.
+"""Why a topic is missing, or less of it is there than was published, in words for `sern top` and the page. Pure.
 
 `view` puts two samples of a daemon together. A daemon knows its own half: a robot's client what leaves it, a site's
 what arrives, a relay both halves of its own hops. What lies beyond is said as far as it is known, and where to look.
 """
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final
 
 from sern_core.vocabulary.types import DropReason
-from sern_tools.explain_story import dropped_because
-from sern_tools.top_state import (
+from sern_runtime.watching.state import (
     UNKNOWN,
     Change,
     Flow,
@@ -24,6 +23,7 @@ from sern_tools.top_state import (
     class_order,
     link_lines,
 )
+from sern_runtime.watching.words import dropped_because
 
 OK: Final = "ok"
 NOTE: Final = "note"
@@ -58,28 +58,45 @@ Word = tuple[str, str]
 
 def view(before: Sample, now: Sample) -> View:
     """What is shown after the second of two looks."""
-    interval_s = max(now.at_s - before.at_s, 1e-3)
-    lines = link_lines(before, now, interval_s)
-    links = lines if now.relay else [line for line in lines if line.peer == _relay_name(now)]
-    peers = [] if now.relay else [line for line in lines if line not in links]
-    situation = _Situation(now, links, peers)
-    topics = [
-        _topic(name, flow, change(before.flows.get(name), flow, interval_s), situation)
-        for name, flow in now.flows.items()
-    ]
-    topics += [_missing(name, word) for name, word in situation.missing()]
-    topics.sort(key=lambda line: (class_order(line.priority), LEVELS.index(line.level), line.topic))
-    return View(
-        now.name,
-        "relay" if now.relay else "client",
-        now.time,
-        tuple(links),
-        tuple(choices(now.adaptation)),
-        tuple(peers),
-        tuple(topics),
-        tuple(situation.notes(now.refused_total - before.refused_total)),
-        tuple(now.events),
-    )
+    comparison = Comparison(before, now)
+    return comparison.view(comparison.topics())
+
+
+class Comparison:
+    """Two looks at a daemon, of which topic by topic is judged: of thousands it takes long."""
+
+    def __init__(self, before: Sample, now: Sample) -> None:
+        self._before = before
+        self._now = now
+        self._interval_s = max(now.at_s - before.at_s, 1e-3)
+        lines = link_lines(before, now, self._interval_s)
+        self._links = lines if now.relay else [line for line in lines if line.peer == _relay_name(now)]
+        self._peers = [] if now.relay else [line for line in lines if line not in self._links]
+        self._situation = _Situation(now, self._links, self._peers)
+
+    def topics(self) -> Iterator[TopicLine]:
+        """A line for each topic, those included that are missing, in no order."""
+        for name, flow in self._now.flows.items():
+            changed = change(self._before.flows.get(name), flow, self._interval_s)
+            yield _topic(name, flow, changed, self._situation)
+        for name, word in self._situation.missing():
+            yield _missing(name, word)
+
+    def view(self, topics: Iterable[TopicLine]) -> View:
+        """All of it, with these topics, urgent classes first, and in each what is wrong."""
+        now = self._now
+        in_order = sorted(topics, key=lambda line: (class_order(line.priority), LEVELS.index(line.level), line.topic))
+        return View(
+            now.name,
+            "relay" if now.relay else "client",
+            now.time,
+            tuple(self._links),
+            tuple(choices(now.adaptation)),
+            tuple(self._peers),
+            tuple(in_order),
+            tuple(self._situation.notes(now.refused_total - self._before.refused_total)),
+            tuple(now.events),
+        )
 
 
 def _relay_name(sample: Sample) -> str:

@@ -1,13 +1,14 @@
-"""What `sern top` shows, out of a daemon's answers: two looks at its counters make rates, and each topic gets a word.
+"""What `sern top` and the page show, out of what a daemon tells: two looks at its counters make rates, and each topic
+gets a word.
 
-Pure: `read` turns answers into a `Sample`, `compare` two of them into a `View`. Why a topic is not there, or less of it
-than there was, is `top_why`'s.
+Pure: `read` turns answers into a `Sample`; who has the rows before they are an answer puts those of topics into a
+`FlowTable`, one at a time. Why a topic is not there, or less of it than there was, is `why`'s.
 """
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from sern_core.site.services import parse as parse_service
 from sern_core.vocabulary.types import CLASS_LABELS, TopicName
@@ -151,52 +152,97 @@ def read(
     events: Sequence[Json] = (),
 ) -> Sample:
     """Out of /api/clients, /api/link, /api/topics, /api/mmcf (None: there is none) and /api/events."""
-    relay = clients["role"] == "relay"
-    flows = _relay_flows(topics) if relay else _client_flows(topics)
-    flows = {name: flow for name, flow in flows.items() if parse_service(TopicName(name)) is None}
+    flows = FlowTable(relay=clients["role"] == "relay")
+    for part in topic_parts(topics):
+        flows.add(part)
+    return sample(at_s, clients, clients["clients"], links, flows, adaptation, events)
+
+
+class TopicPart(NamedTuple):
+    """One row of /api/topics. `table`: that of a relay where it is (`links`, of `peer`; `received`; `announced`), or
+    `client`."""
+
+    table: str
+    peer: str
+    topic: str
+    row: Json
+
+
+def topic_parts(topics: Json) -> Iterator[TopicPart]:
+    """The rows of /api/topics."""
+    if not (topics.keys() >= {"links", "received", "announced"}):
+        for name, row in topics.items():
+            yield TopicPart("client", "", name, row)
+        return
+    for client, rows in topics["links"].items():
+        for name, row in rows.items():
+            yield TopicPart("links", client, name, row)
+    for table in ("received", "announced"):
+        for name, row in topics[table].items():
+            yield TopicPart(table, "", name, row)
+
+
+class FlowTable:
+    """What is known of each topic, out of rows in any order. Streams of services are none."""
+
+    def __init__(self, *, relay: bool) -> None:
+        self.relay = relay
+        self.flows: dict[str, Flow] = {}
+
+    def add(self, part: TopicPart) -> None:
+        name, row = part.topic, part.row
+        flow = self.flows.get(name)
+        if flow is None:
+            if parse_service(TopicName(name)) is not None:
+                return
+            flow = self.flows[name] = Flow(row["class"], announced=not self.relay)
+        match part.table:
+            case "links":
+                _sent(flow, part.peer, row)
+            case "received":
+                _arrived(flow, row)
+            case "announced":
+                flow.announced = True
+                flow.untaken = not row["taken"]
+                flow.owners = tuple(sorted(row["owners"]))
+                flow.latched = row["latched"]
+            case _:
+                _of_client(flow, row)
+
+
+def sample(
+    at_s: float,
+    head: Json,
+    clients: Sequence[Json],
+    links: Sequence[Json],
+    flows: FlowTable,
+    adaptation: Json | None,
+    events: Sequence[Json],
+) -> Sample:
+    """Of parts that were read one by one; `head` is /api/clients without its rows."""
     return Sample(
         at_s,
-        clients["time"],
-        clients["name"],
-        relay,
-        flows,
+        head["time"],
+        head["name"],
+        flows.relay,
+        flows.flows,
         links,
-        clients["clients"],
+        clients,
         adaptation,
         tuple(events),
-        clients["refused_total"],
+        head["refused_total"],
     )
 
 
-def _client_flows(topics: Json) -> dict[str, Flow]:
-    flows = {}
-    for name, row in topics.items():
-        flow = flows[name] = Flow(row["class"], latched=row["latched"])
-        flow.owners = tuple(owner for owner in row["owner"].split(",") if owner)
-        if row["direction"] == "send":
-            _sent(flow, "", row)
-            if "received" in row:
-                _arrived(flow, row["received"])
-        else:
-            _arrived(flow, row)
-    return flows
-
-
-def _relay_flows(topics: Json) -> dict[str, Flow]:
-    flows: dict[str, Flow] = {}
-    for client, rows in topics["links"].items():
-        for name, row in rows.items():
-            _sent(flows.setdefault(name, Flow(row["class"])), client, row)
-    for name, row in topics["received"].items():
-        _arrived(flows.setdefault(name, Flow(row["class"])), row)
-    for name, row in topics["announced"].items():
-        flow = flows.setdefault(name, Flow(row["class"]))
-        flow.untaken = not row["taken"]
-        flow.owners = tuple(sorted(row["owners"]))
-        flow.latched = row["latched"]
-    for name, flow in flows.items():
-        flow.announced = name in topics["announced"]
-    return flows
+def _of_client(flow: Flow, row: Json) -> None:
+    flow.latched = row["latched"]
+    flow.owners = tuple(owner for owner in row["owner"].split(",") if owner)
+    if row["direction"] == "send":
+        _sent(flow, "", row)
+        if "received" in row:
+            _arrived(flow, row["received"])
+    else:
+        _arrived(flow, row)
 
 
 def _sent(flow: Flow, peer: str, row: Json) -> None:
