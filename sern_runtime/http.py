@@ -17,6 +17,7 @@ from prometheus_client.exposition import choose_encoder
 
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_runtime.http_access import HttpAccess
+from sern_runtime.http_connections import HttpConnections
 from sern_runtime.http_routes import HealthCheck, JsonParts, JsonQuery, JsonSource, UnknownError
 from sern_runtime.metrics import Metrics, exposition
 from sern_runtime.optional import OptionalParts
@@ -30,6 +31,7 @@ MAX_ANSWER_BYTES: Final = 64 * 2**20
 SLICE_PIECES: Final = 100
 SLICE_BYTES: Final = 2**18
 """Pieces and bytes of a large answer that are made in one turn of the loop: about 5 ms."""
+BACKLOG: Final = 128
 HEALTH: Final = ("/healthz", "/readyz")
 PART: Final = "http"
 _log = logging.getLogger(__name__)
@@ -98,6 +100,8 @@ class HttpServer:
         self._host, self._port = parse_listen(listen)
         self._registry = registry
         self._runner: web.AppRunner | None = None
+        self._connections: HttpConnections | None = None
+        self._server: asyncio.Server | None = None
         self._requests = _RequestLog()
         self._scraping = asyncio.Lock()
         self._app = web.Application(middlewares=[self._survive, self._admit])
@@ -129,6 +133,11 @@ class HttpServer:
             read=lambda: [((), float(self._requests.refused))],
         )
         metrics.counter(
+            "sern_http_connections_refused_total",
+            "Connections to the HTTP server that were closed because there were as many as may be.",
+            read=lambda: [((), float(self._connections.refused if self._connections else 0))],
+        )
+        metrics.counter(
             "sern_http_unauthorized_total",
             "Requests to the HTTP server without the token, or by a name where there is no token.",
             ("reason",),
@@ -138,9 +147,9 @@ class HttpServer:
     @property
     def port(self) -> int:
         """The port in use, also when 0 was asked for."""
-        if self._runner is None or not self._runner.addresses:
+        if self._server is None:
             raise UsageError("the server is not started")
-        return int(self._runner.addresses[0][1])
+        return int(self._server.sockets[0].getsockname()[1])
 
     @property
     def refused(self) -> int:
@@ -159,13 +168,19 @@ class HttpServer:
         )
         self._runner = runner
         await runner.setup()
+        assert runner.server is not None
+        self._connections = HttpConnections(runner.server)
+        loop = asyncio.get_running_loop()
         try:
-            await web.TCPSite(runner, self._host, self._port).start()
+            self._server = await loop.create_server(self._connections, self._host, self._port, backlog=BACKLOG)
         except OSError as error:
             await self.stop()
             raise ConfigError(f"cannot listen on http://{self.listen}: {bind_problem(error)}") from error
 
     async def stop(self) -> None:
+        if self._server is not None:
+            self._server.close()
+            self._server = None
         if self._runner is not None:
             runner, self._runner = self._runner, None
             await runner.cleanup()

@@ -15,7 +15,7 @@ from sern_runtime.http import IDLE_S, HttpServer, parse_listen
 from sern_runtime.http_access import HttpAccess
 from sern_runtime.http_routes import Health
 from sern_runtime.metrics import Metrics
-from tests.support import until
+from tests.support import DEADLINE_S, until
 
 
 class Daemon:
@@ -134,6 +134,38 @@ async def test_a_port_in_use_is_one_line() -> None:
 async def test_an_address_of_another_machine() -> None:
     with pytest.raises(ConfigError, match="no such address"):
         await Daemon("192.0.2.1:9464").server.start()
+
+
+async def test_there_are_no_more_connections_than_may_be() -> None:
+    """One address has 32 at the most; others come in meanwhile, and so does it when it has closed one."""
+    daemon = Daemon()
+    await daemon.server.start()
+    address = ("127.0.0.1", daemon.server.port)
+    idle = [await asyncio.open_connection(*address, local_addr=("127.0.0.9", 0)) for _ in range(32)]
+    reader, writer = await asyncio.open_connection(*address, local_addr=("127.0.0.9", 0))
+    with suppress(ConnectionError):
+        assert await reader.read() == b""
+    writer.close()
+    _status, _kind, text = await daemon.get("/metrics")
+    assert "sern_http_connections_refused_total 1.0" in text
+    idle.pop()[1].close()
+
+    async def served() -> bool:
+        reader, writer = await asyncio.open_connection(*address, local_addr=("127.0.0.9", 0))
+        try:
+            writer.write(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
+            return (await reader.read()).startswith(b"HTTP/1.1 200")
+        except ConnectionError:
+            return False
+        finally:
+            writer.close()
+
+    async with asyncio.timeout(DEADLINE_S):
+        while not await served():
+            pass
+    for _reader, writer in idle:
+        writer.close()
+    await daemon.server.stop()
 
 
 async def test_stopping_does_not_wait_for_a_client_that_keeps_its_connection() -> None:
