@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from sern_client.actions import GoalWatch
+from sern_client.asking import Asking
 from sern_client.durable import DurableTopics
 from sern_client.endpoints.common.saying import SayOnce
 from sern_client.guard import Guard
@@ -67,6 +68,8 @@ class Bridge:
         self.durable = None if make_durable is None else make_durable(self.core)
         self.outbound = Outbound(site, self.core, discovery, goals=goals, durable=self.durable)
         self.inbound = Inbound(site, self.core, guard=guard, goals=goals, withdraws=withdraws)
+        self.asking = Asking(site, self.core, self.outbound.refused.get)
+        """Requests of other clients, and to them."""
         self.goals = goals
         self.services = None if make_services is None else make_services(self.core)
         self._said = SayOnce(_log)
@@ -124,7 +127,9 @@ class Bridge:
     # --- of streams from elsewhere ----------------------------------------------------------------------------------
 
     def stream_opened(self, stream: StreamInfo) -> None:
-        if parse_service(stream.id.topic) is None:
+        if self.asking.takes(stream.id.topic):
+            self.asking.opened(stream)
+        elif parse_service(stream.id.topic) is None:
             self.inbound.stream_opened(stream)
         elif self.services is not None:
             self.services.stream_opened(stream)
@@ -139,7 +144,9 @@ class Bridge:
     def message(self, stream: StreamInfo, message: Message, *, now: float) -> DropReason | None:
         if stream.id in self.inbound.streams:
             return self.inbound.message(stream, message, now=now)
-        if self.services is not None:
+        if self.asking.takes(stream.id.topic):
+            self.asking.message(stream, message)
+        elif self.services is not None:
             self.services.message(stream, message)
         return None
 

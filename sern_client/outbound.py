@@ -8,6 +8,7 @@ from typing import Final
 
 from sern_client.actions import GoalWatch
 from sern_client.durable import DurableTopics
+from sern_client.e_stop import EStops
 from sern_client.endpoints.base import Difference, Sink, Subscription
 from sern_client.entry import Entry
 from sern_client.frames import Rewrite
@@ -97,6 +98,8 @@ class Outbound:
         """Those of the session, by global name, in the relay's words."""
         self.reckoned = 0
         """Poses that were not sent, because whoever receives them is right without."""
+        self.e_stops: EStops | None = None
+        """What is to be told of messages of its topics; None: this site has no e-stop."""
         self.summaries = Summaries(self._sender, site.parts)
         self.leaving = Leaving(self._unpublish)
         self._site = site
@@ -218,6 +221,8 @@ class Outbound:
             sink = self._reckoned(info, sink)
         if self._goals is not None:
             sink = self._goals.outgoing(info, channel, sink)
+        if self.e_stops is not None and info.name in self.e_stops.topics:
+            sink = self._watched(info, sink, self.e_stops)
         return channel, source, Entry(sink, channel, send if sink is plain else None)
 
     # --- other rules ------------------------------------------------------------------------------------------------
@@ -368,6 +373,13 @@ class Outbound:
         rewrite = self._site.frames.outgoing(info)
         keep = durable.sender(channel, self._send(channel, None, forced=True), self.stored.of(info))
         return lambda body, stamp_ns: keep(body if rewrite is None else rewrite(body), stamp_ns, None)
+
+    def _watched(self, info: TopicInfo, sink: Sink, e_stops: EStops) -> Sink:
+        def watched(body: bytes, stamp_ns: int) -> bool:
+            e_stops.heard(info, body, where="this site")
+            return sink(body, stamp_ns)
+
+        return watched
 
     def _reckoned(self, info: TopicInfo, sink: Sink) -> Sink:
         from sern_client.reckoned import ReckonedPoses  # who does not ask for it need not load it

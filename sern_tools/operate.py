@@ -88,6 +88,24 @@ def _done(answer: dict[str, Any]) -> str:
     return f"{answer['topic']}  {_words(answer['set'])}{waits}"
 
 
+def release_command(
+    topic: Annotated[str, typer.Argument(help="This client's e-stop, or another site's by its global name.")],
+    client: Client = None,
+) -> None:
+    """Release an e-stop that is latched, so that commands are obeyed again. Look at the robot first.
+
+    Who may release the e-stop of another site is who may publish it there (the relay's access rules).
+
+    Exit code 0 when it is done, 1 when it could not be, 2 for wrong usage.
+    """
+    try:
+        answer = ask(socket_of(client), {"do": "release", "topic": topic})
+    except SernError as error:
+        raise typer.Exit(say("sern release", error)) from None
+    done = f"{answer['at']} was told to release it" if answer["at"] else "released"
+    print(f"{answer['topic']}  {done}")
+
+
 def set_command(
     topic: Annotated[
         str | None, typer.Argument(help="A topic that this client sends; nothing: list what is set.")

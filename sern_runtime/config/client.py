@@ -183,6 +183,16 @@ class LossSection(Section):
         return Lease(self.publish, self.after_s, ramp)
 
 
+class EStopSection(Section):
+    """A message of this topic is an emergency stop: a std_msgs/Bool that is true, or any message of another type."""
+
+    stops: tuple[Pattern, ...] = ("/cmd_vel",)
+    """Topics (local names) whose commands of other sites are refused until it is released, by `sern release`."""
+    file: PathText | None = None
+    """Where it is kept that it is latched; null: NAME.e_stop in the unit's state directory, else beside this file. All
+    e-stops of a client have the same."""
+
+
 _COMMAND: Final = re.compile("cmd|command|joy|teleop|twist", re.IGNORECASE)
 """What the names of command topics have in them."""
 _COMMAND_TYPE: Final = re.compile("Twist|AckermannDrive|JointJog|JointTrajectory")
@@ -248,6 +258,9 @@ class TopicSection(Section):
     """Several clients may publish this global name; null: only /tf and /tf_static."""
     remap: TopicText | None = None
     """Another name for this topic outside this site, before the namespace; needs a plain name in `match`."""
+    e_stop: EStopSection | None = None
+    """Its messages, from here or from elsewhere, latch an emergency stop at this client; needs a plain name in
+    `match`. What is released by name stays released."""
     on_link_loss: LossSection | None = None
     """What to publish when commands stop, for topics of type geometry_msgs/Twist or TwistStamped that come in."""
     summary: OneOrMoreSummaries = ()
@@ -312,6 +325,8 @@ class TopicSection(Section):
             ):
                 if given:
                     raise fault(why, key)
+        if self.e_stop is not None and name_problem(self.match):
+            raise fault("is of one topic, which needs a plain name in `match`", "e_stop")
         if self.on_link_loss is not None:
             if self.direction is Direction.SEND:
                 raise fault("acts where commands arrive; direction is send", "on_link_loss")
