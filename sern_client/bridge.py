@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable
+from functools import partial
 from typing import Protocol
 
 from sern_client.actions import GoalWatch
@@ -9,6 +10,7 @@ from sern_client.asking import Asking
 from sern_client.durable import DurableTopics
 from sern_client.endpoints.common.saying import SayOnce
 from sern_client.guard import Guard
+from sern_client.holding import Holding
 from sern_client.inbound import Inbound
 from sern_client.outbound import Outbound
 from sern_client.services import ServiceBridge
@@ -70,6 +72,10 @@ class Bridge:
         self.inbound = Inbound(site, self.core, guard=guard, goals=goals, withdraws=withdraws)
         self.asking = Asking(site, self.core, self.outbound.refused.get)
         """Requests of other clients, and to them."""
+        self.holding = Holding(site, self.core, self.asking, partial(self.inbound.subscribed.add, "asking"))
+        """Who commands which robot."""
+        self.inbound.elsewhere = self.asking.takes
+        self.outbound.holding = self.inbound.commands.holding = self.holding
         self.goals = goals
         self.services = None if make_services is None else make_services(self.core)
         self._said = SayOnce(_log)

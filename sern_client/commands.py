@@ -12,6 +12,7 @@ from typing import Final
 
 from sern_client.e_stop import EStops
 from sern_client.guard import Guard
+from sern_client.holding import Holding
 from sern_client.site import Site
 from sern_core.bodies.twist import TwistBody
 from sern_core.site.client import ClientCore
@@ -49,6 +50,8 @@ class Commands:
 
     def __init__(self, site: Site, core: ClientCore, guard: Guard | None) -> None:
         self.leases_fired = 0
+        self.holding: Holding | None = None
+        """Who of several operators is obeyed; None: all are."""
         self.e_stops: EStops | None = None
         """While one is latched no command is obeyed; None: this site has none."""
         self._site = site
@@ -92,6 +95,8 @@ class Commands:
             return None
         if self.e_stops is not None and self.e_stops.stopped(command.info.name) is not None:
             return DropReason.E_STOP
+        if self.holding is not None and not self.holding.obeys(command.info.name, stream.origin, now=now):
+            return DropReason.NOT_HOLDER
         if command.lease.overtaken(born_s=born_s, now=now):
             return DropReason.SUPERSEDED
         return None
@@ -128,6 +133,8 @@ class Commands:
         command = self._open.pop(stream, None)
         if command is None:
             return False
+        if self.holding is not None:
+            self.holding.ended(command.info.name, stream.origin)
         armed = command.lease.deadline() is not None
         if armed and command.ramped and len(self._ending) < MAX_ENDING:
             before = self._ending.pop(command.info.name, None)

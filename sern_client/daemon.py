@@ -152,6 +152,7 @@ class ClientDaemon:
         self.on_demand = self._make_on_demand(endpoint, objects)
         self.adaptation = self._make_adaptation()
         self.e_stops = self._make_e_stops()
+        self._keep_holders()
         self.operating = Operating(
             loaded,
             self.bridge,
@@ -240,8 +241,17 @@ class ClientDaemon:
                                            namespace=self.site.namespace)  # fmt: skip
             release = partial(made.release, stop.topic)
             bridge.asking.listen(TopicName(f"{name}{RELEASE_SUFFIX}"), lambda who, _text, do=release: do(who=who))  # type: ignore[misc]
-        bridge.inbound.elsewhere = bridge.asking.topics
         return made
+
+    def _keep_holders(self) -> None:
+        """Have one operator at a time command each topic of this robot whose rule says so."""
+        for section in self.loaded.model.topics:
+            if section.holder is None or not section.direction.receives:
+                continue
+            local = TopicName(section.match)
+            info = TopicInfo(local, "", Encoding.CDR)
+            name = self.site.rules.outward(info, local_name=local, namespace=self.site.namespace)
+            self.bridge.holding.keep(local, name, section.holder.lapse_s)
 
     def _make_keyring(self) -> ClientKeyring | None:
         relay = self.loaded.model.relay
@@ -408,6 +418,7 @@ class ClientDaemon:
             self.check.tick(now=clock.now())
             self.link_state.look()
             self.bridge.outbound.leaving.look(now=clock.now())
+            self.bridge.holding.look()
             if self.bridge.durable is not None:
                 self.bridge.durable.look()
             if watchdog.interval_s is not None:

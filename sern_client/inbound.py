@@ -104,8 +104,8 @@ class Inbound:
         self.publish_failures = 0
         self.e_stops: EStops | None = None
         """What is to be told of every message; None: this site has no e-stop."""
-        self.elsewhere: Collection[TopicName] = ()
-        """Topics that are not published here but taken by another part."""
+        self.elsewhere: Callable[[TopicName], bool] = lambda _name: False
+        """Whether a topic is not published here but taken by another part."""
         self.commands = Commands(site, core, guard)
         """Those that are published here, and what is said when they stay away."""
         self._site = site
@@ -395,7 +395,7 @@ class Inbound:
     def validate(self) -> list[Difference]:
         """Compare our table with the core's: what is not as it should be."""
         opened = {stream for stream in self._core.opened if parse_service(stream.topic) is None}
-        streams = {stream for stream in opened if stream.topic not in self.elsewhere}
+        streams = {stream for stream in opened if not self.elsewhere(stream.topic)}
         halves = (("the core", streams - self._streams.keys()), ("the bridge", self._streams.keys() - streams))
         return [
             Difference(stream.topic, f"a stream of {stream.origin} is open in {where} only")

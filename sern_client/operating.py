@@ -7,6 +7,7 @@ Requests, a JSON object each (`sern_runtime/local_socket.py`):
     {"do": "reset", "topic": "/scan"}
     {"do": "profile", "name": "mapping"}                                  null: the file's
     {"do": "release", "topic": "/robot1/e_stop"}
+    {"do": "take", "topic": "/robot1/cmd_vel", "how": "ask"}              or force, give; null: who holds it
 """
 
 import logging
@@ -16,6 +17,7 @@ from typing import Any, Final
 
 from sern_client.bridge import Bridge
 from sern_client.e_stop import RELEASE_SUFFIX, EStops
+from sern_client.holding import WORDS
 from sern_client.settings import Settings
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
@@ -69,6 +71,7 @@ class Operating:
             "reset": self._reset,
             "profile": self._profile,
             "release": self._release,
+            "take": self._take,
         }
         self._server: LocalServer | None = None
 
@@ -196,6 +199,16 @@ class Operating:
             return {"topic": local, "at": ""}
         await self._bridge.asking.ask(TopicName(f"{name}{RELEASE_SUFFIX}"), "release")
         return {"topic": name, "at": "its site"}
+
+    async def _take(self, request: Json) -> Json:
+        """Who holds a command topic, or that another one shall."""
+        name, how = TopicName(str(request.get("topic", ""))), request.get("how")
+        holding = self._bridge.holding
+        if how is None:
+            return {"held": holding.to_json()}
+        if how not in WORDS:
+            raise UsageError(f"{str(how)[:40]!r} is none of {', '.join(WORDS)}")
+        return {"topic": name, **await holding.take(name, str(how))}
 
     def _local(self, request: Json) -> TopicName:
         """The topic of a request by its local name, which may be given by the global one. What only comes in here is
