@@ -2,12 +2,15 @@
 
 import logging
 from collections.abc import Callable
+from functools import partial
 from typing import Protocol
 
 from sern_client.actions import GoalWatch
+from sern_client.asking import Asking
 from sern_client.durable import DurableTopics
 from sern_client.endpoints.common.saying import SayOnce
 from sern_client.guard import Guard
+from sern_client.holding import Holding
 from sern_client.inbound import Inbound
 from sern_client.outbound import Outbound
 from sern_client.services import ServiceBridge
@@ -67,6 +70,12 @@ class Bridge:
         self.durable = None if make_durable is None else make_durable(self.core)
         self.outbound = Outbound(site, self.core, discovery, goals=goals, durable=self.durable)
         self.inbound = Inbound(site, self.core, guard=guard, goals=goals, withdraws=withdraws)
+        self.asking = Asking(site, self.core, self.outbound.refused.get)
+        """Requests of other clients, and to them."""
+        self.holding = Holding(site, self.core, self.asking, partial(self.inbound.subscribed.add, "asking"))
+        """Who commands which robot."""
+        self.inbound.elsewhere = self.asking.takes
+        self.outbound.holding = self.inbound.commands.holding = self.holding
         self.goals = goals
         self.services = None if make_services is None else make_services(self.core)
         self._said = SayOnce(_log)
@@ -124,7 +133,9 @@ class Bridge:
     # --- of streams from elsewhere ----------------------------------------------------------------------------------
 
     def stream_opened(self, stream: StreamInfo) -> None:
-        if parse_service(stream.id.topic) is None:
+        if self.asking.takes(stream.id.topic):
+            self.asking.opened(stream)
+        elif parse_service(stream.id.topic) is None:
             self.inbound.stream_opened(stream)
         elif self.services is not None:
             self.services.stream_opened(stream)
@@ -139,7 +150,9 @@ class Bridge:
     def message(self, stream: StreamInfo, message: Message, *, now: float) -> DropReason | None:
         if stream.id in self.inbound.streams:
             return self.inbound.message(stream, message, now=now)
-        if self.services is not None:
+        if self.asking.takes(stream.id.topic):
+            self.asking.message(stream, message)
+        elif self.services is not None:
             self.services.message(stream, message)
         return None
 

@@ -193,6 +193,16 @@ def _register_operating(metrics: Metrics, operating: Operating | None) -> None:
         "Topics of which something is set by hand (sern set).",
         read=lambda: [((), float(0 if operating is None else len(operating.settings.by_topic)))],
     )
+    metrics.gauge(
+        "sern_e_stop_latched",
+        "1 while an e-stop is latched: commands are refused.",
+        ("topic",),
+        lambda: (
+            []
+            if operating is None
+            else [((t,), float(t in operating.e_stops.latched)) for t in operating.e_stops.topics]
+        ),
+    )
     metrics.counter(
         "sern_client_local_refused_total",
         "Connections and requests on the local socket that were refused.",

@@ -10,11 +10,14 @@ from collections.abc import Callable, KeysView
 from dataclasses import dataclass, field
 from typing import Final
 
+from sern_client.e_stop import EStops
 from sern_client.guard import Guard
+from sern_client.holding import Holding
 from sern_client.site import Site
 from sern_core.bodies.twist import TwistBody
 from sern_core.site.client import ClientCore
 from sern_core.site.lease import CommandLease
+from sern_core.topics.patterns import PatternSet
 from sern_core.topics.rules import Lease
 from sern_core.vocabulary.message import StreamId, TopicInfo
 from sern_core.vocabulary.types import DropReason, TopicName
@@ -47,6 +50,10 @@ class Commands:
 
     def __init__(self, site: Site, core: ClientCore, guard: Guard | None) -> None:
         self.leases_fired = 0
+        self.holding: Holding | None = None
+        """Who of several operators is obeyed; None: all are."""
+        self.e_stops: EStops | None = None
+        """While one is latched no command is obeyed; None: this site has none."""
         self._site = site
         self._core = core
         self._guard = guard
@@ -84,9 +91,25 @@ class Commands:
     def refuses(self, stream: StreamId, *, born_s: float, now: float) -> DropReason | None:
         """Why a command that comes now is not to be obeyed; None: it is. Ask it of every command, before `renew`."""
         command = self._open.get(stream)
-        if command is not None and command.lease.overtaken(born_s=born_s, now=now):
+        if command is None:
+            return None
+        if self.e_stops is not None and self.e_stops.stopped(command.info.name) is not None:
+            return DropReason.E_STOP
+        if self.holding is not None and not self.holding.obeys(command.info.name, stream.origin, now=now):
+            return DropReason.NOT_HOLDER
+        if command.lease.overtaken(born_s=born_s, now=now):
             return DropReason.SUPERSEDED
         return None
+
+    def halt(self, names: PatternSet) -> None:
+        """Tell the robots of these command topics (local names) to stand, at once and without a ramp."""
+        for command in (*self._open.values(), *self._ending.values()):
+            if names.fullmatch(command.info.name):
+                command.lease.halt(now=clock.now())
+                command.publish(command.stop, time.time_ns())
+                if self._guard is not None and command.guarded is not None:
+                    self._guard.commanded(command.guarded, command.lease.deadline(), None)
+        self._arm()
 
     def renew(self, stream: StreamId, body: bytes, *, born_s: float, now: float) -> None:
         """A command is about to be published as `body`: no stop command of before may come after it."""
@@ -110,6 +133,8 @@ class Commands:
         command = self._open.pop(stream, None)
         if command is None:
             return False
+        if self.holding is not None:
+            self.holding.ended(command.info.name, stream.origin)
         armed = command.lease.deadline() is not None
         if armed and command.ramped and len(self._ending) < MAX_ENDING:
             before = self._ending.pop(command.info.name, None)

@@ -21,6 +21,7 @@ from sern_client.checks import TableCheck
 from sern_client.client_metrics import Counting, register_client
 from sern_client.connection import Connection
 from sern_client.durable import DurableTopics
+from sern_client.e_stop import RELEASE_SUFFIX, EStops
 from sern_client.endpoints.base import (
     BothTold,
     Endpoint,
@@ -30,7 +31,7 @@ from sern_client.endpoints.base import (
     viewers_of,
 )
 from sern_client.endpoints.composite import with_services
-from sern_client.factory import local_encoding, make_endpoint, make_link_topics
+from sern_client.factory import e_stops_of, local_encoding, make_endpoint, make_link_topics
 from sern_client.guard import Guard
 from sern_client.keyring import ClientKeyring, KeyFiles
 from sern_client.link_news import SILENT, LinkNews
@@ -51,7 +52,7 @@ from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.key_news import ClientKeys, RelayKeys
 from sern_core.vocabulary.message import TopicInfo, TopicSpec
 from sern_core.vocabulary.trace import DecisionTrace
-from sern_core.vocabulary.types import CLASS_LABELS, DropReason, ObjectKind
+from sern_core.vocabulary.types import CLASS_LABELS, DropReason, Encoding, ObjectKind, TopicName
 from sern_core.wire import framing
 from sern_runtime import clock, ros_types
 from sern_runtime.adaptation import Adaptation
@@ -150,12 +151,15 @@ class ClientDaemon:
         self.scene = make_scene(loaded, endpoint, self.site, objects, local_encoding(model))
         self.on_demand = self._make_on_demand(endpoint, objects)
         self.adaptation = self._make_adaptation()
+        self.e_stops = self._make_e_stops()
+        self._keep_holders()
         self.operating = Operating(
             loaded,
             self.bridge,
             self.adaptation,
             self.events,
             self.notifier,
+            e_stops=self.e_stops,
             status=self._status,
             reload_keys=self._reload_keys,
         )
@@ -189,6 +193,7 @@ class ClientDaemon:
         self.connection = Connection(
             self.core, model.relay, model.link, on_down=self.link_down, on_refused=self._key_refused
         )
+        self.bridge.inbound.subscribed.add("asking", self.bridge.asking.topics)
         self.bridge.inbound.subscribed.begin(model.subscribe_patterns())
         self.core.subscribe_objects(model.object_selections(), now=now)
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
@@ -224,6 +229,29 @@ class ClientDaemon:
         """How a topic of this site is treated, by its global name."""
         name = self.site.rules.inward(info.name, namespace=self.site.namespace)
         return self.site.rules.resolve(replace(info, name=name), local_name=name).spec
+
+    def _make_e_stops(self) -> EStops:
+        """The e-stops of the file; they are told of messages, and listen for their release."""
+        bridge, (stops, path) = self.bridge, e_stops_of(self.loaded)
+        made = EStops(stops, path, self.events, halt=bridge.inbound.commands.halt)
+        if stops:
+            bridge.inbound.e_stops = bridge.outbound.e_stops = bridge.inbound.commands.e_stops = made
+        for stop in stops:
+            name = self.site.rules.outward(TopicInfo(stop.topic, "", Encoding.CDR), local_name=stop.topic,
+                                           namespace=self.site.namespace)  # fmt: skip
+            release = partial(made.release, stop.topic)
+            bridge.asking.listen(TopicName(f"{name}{RELEASE_SUFFIX}"), lambda who, _text, do=release: do(who=who))  # type: ignore[misc]
+        return made
+
+    def _keep_holders(self) -> None:
+        """Have one operator at a time command each topic of this robot whose rule says so."""
+        for section in self.loaded.model.topics:
+            if section.holder is None or not section.direction.receives:
+                continue
+            local = TopicName(section.match)
+            info = TopicInfo(local, "", Encoding.CDR)
+            name = self.site.rules.outward(info, local_name=local, namespace=self.site.namespace)
+            self.bridge.holding.keep(local, name, section.holder.lapse_s)
 
     def _make_keyring(self) -> ClientKeyring | None:
         relay = self.loaded.model.relay
@@ -390,6 +418,7 @@ class ClientDaemon:
             self.check.tick(now=clock.now())
             self.link_state.look()
             self.bridge.outbound.leaving.look(now=clock.now())
+            self.bridge.holding.look()
             if self.bridge.durable is not None:
                 self.bridge.durable.look()
             if watchdog.interval_s is not None:

@@ -3,16 +3,18 @@
 import logging
 import os
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Final
 
 from sern_client.actions import ACCEPT_S
+from sern_client.e_stop import EStop
 from sern_client.endpoints.base import Endpoint, Publisher
 from sern_client.endpoints.composite import CompositeEndpoint, with_services
 from sern_client.link_topics import LinkTopics
 from sern_client.sections import Resolve, make_section
-from sern_core.topics.patterns import compile_pattern
+from sern_core.topics.patterns import PatternSet, compile_pattern
 from sern_core.vocabulary.message import TopicInfo
-from sern_core.vocabulary.types import Encoding
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime.config import endpoints as sections
 from sern_runtime.config.client import ClientFile
 from sern_runtime.config.foxglove import FoxgloveEndpoint
@@ -132,3 +134,16 @@ def named_sections(model: ClientFile) -> list[sections.EndpointSection]:
                 section = section.model_copy(update={"node_name": name})
         named.append(section)
     return named
+
+
+def e_stops_of(loaded: Loaded[ClientFile]) -> tuple[list[EStop], Path]:
+    """The e-stops of a client's file, and where it is kept that they are latched."""
+    model = loaded.model
+    sections = [(section, section.e_stop) for section in model.topics if section.e_stop is not None]
+    stops = [EStop(TopicName(section.match), PatternSet(said.stops)) for section, said in sections]
+    named = next((said.file for _section, said in sections if said.file is not None), None)
+    if named is not None:
+        return stops, loaded.resolve(named)
+    state = os.environ.get("STATE_DIRECTORY", "").split(":")[-1]
+    folder = Path(state) if state else loaded.path.parent.resolve()
+    return stops, folder / f"{model.name}.e_stop"

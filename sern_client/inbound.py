@@ -11,6 +11,7 @@ from typing import Final
 
 from sern_client.actions import GoalWatch
 from sern_client.commands import Commands
+from sern_client.e_stop import EStops
 from sern_client.endpoints.base import Difference, Publisher, keepers_of, publisher_within, teller_of_age
 from sern_client.frames import Rewrite
 from sern_client.guard import Guard
@@ -101,6 +102,10 @@ class Inbound:
         """What the relay does not let us have, in its words, with the code."""
         self.deadlines_missed: dict[TopicName, int] = {}
         self.publish_failures = 0
+        self.e_stops: EStops | None = None
+        """What is to be told of every message; None: this site has no e-stop."""
+        self.elsewhere: Callable[[TopicName], bool] = lambda _name: False
+        """Whether a topic is not published here but taken by another part."""
         self.commands = Commands(site, core, guard)
         """Those that are published here, and what is said when they stay away."""
         self._site = site
@@ -261,6 +266,8 @@ class Inbound:
             refused = self.commands.refuses(stream.id, born_s=message.born_s, now=now)
             if refused is not None:
                 return refused
+        if self.e_stops is not None:
+            self.e_stops.heard(incoming.info, message.body, where=stream.id.origin)
         self._site.values.passed(stream, message.seq, message.body)
         age_s = now - message.born_s
         if incoming.commands:
@@ -387,7 +394,8 @@ class Inbound:
 
     def validate(self) -> list[Difference]:
         """Compare our table with the core's: what is not as it should be."""
-        streams = {stream for stream in self._core.opened if parse_service(stream.topic) is None}
+        opened = {stream for stream in self._core.opened if parse_service(stream.topic) is None}
+        streams = {stream for stream in opened if not self.elsewhere(stream.topic)}
         halves = (("the core", streams - self._streams.keys()), ("the bridge", self._streams.keys() - streams))
         return [
             Difference(stream.topic, f"a stream of {stream.origin} is open in {where} only")

@@ -6,6 +6,8 @@ Requests, a JSON object each (`sern_runtime/local_socket.py`):
     {"do": "set", "topic": "/scan", "words": ["max_rate_hz=2"]}
     {"do": "reset", "topic": "/scan"}
     {"do": "profile", "name": "mapping"}                                  null: the file's
+    {"do": "release", "topic": "/robot1/e_stop"}
+    {"do": "take", "topic": "/robot1/cmd_vel", "how": "ask"}              or force, give; null: who holds it
 """
 
 import logging
@@ -14,9 +16,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from sern_client.bridge import Bridge
+from sern_client.e_stop import RELEASE_SUFFIX, EStops
+from sern_client.holding import WORDS
 from sern_client.settings import Settings
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.names import name_problem
 from sern_core.vocabulary.types import TopicName
 from sern_runtime import clock
 from sern_runtime.adaptation import Adaptation
@@ -46,6 +51,7 @@ class Operating:
         events: EventLog,
         notifier: Notifier,
         *,
+        e_stops: EStops,
         status: Callable[[], str],
         reload_keys: Callable[[], None],
     ) -> None:
@@ -57,12 +63,15 @@ class Operating:
         self._events = events
         self._notifier = notifier
         self._status = status
+        self.e_stops = e_stops
         self._reload_keys = reload_keys
         self._commands: dict[str, Callable[[Json], Awaitable[Json]]] = {
             "list": self._list,
             "set": self._set,
             "reset": self._reset,
             "profile": self._profile,
+            "release": self._release,
+            "take": self._take,
         }
         self._server: LocalServer | None = None
 
@@ -148,7 +157,11 @@ class Operating:
 
     def to_json(self) -> dict[str, Any]:
         """What is set by hand, and which topics wait to be offered otherwise."""
-        return {**self.settings.to_json(), "changing": list(self._bridge.outbound.changing)}
+        return {
+            **self.settings.to_json(),
+            "changing": list(self._bridge.outbound.changing),
+            "e_stops": dict(self.e_stops.latched),
+        }
 
     async def _set(self, request: Json) -> Json:
         words = request.get("words")
@@ -172,6 +185,30 @@ class Operating:
         words = "the profile of the adaptation is the file's again" if profile is None else "profile set by hand: %s"
         self._events.say(_log, logging.WARNING, "set", "", words, *(() if profile is None else (profile,)))
         return {"profile": profile}
+
+    async def _release(self, request: Json) -> Json:
+        """Release an e-stop: our own, or, by its global name, that of another site."""
+        name = TopicName(str(request.get("topic", "")))
+        problem = name_problem(name)
+        if problem is not None:
+            raise UsageError(f"topic {name[:80]!r} {problem}")
+        site = self._bridge.site
+        local = name if name in self.e_stops.topics else site.rules.inward(name, namespace=site.namespace)
+        if local in self.e_stops.topics:
+            self.e_stops.release(local, who="an operator here")
+            return {"topic": local, "at": ""}
+        await self._bridge.asking.ask(TopicName(f"{name}{RELEASE_SUFFIX}"), "release")
+        return {"topic": name, "at": "its site"}
+
+    async def _take(self, request: Json) -> Json:
+        """Who holds a command topic, or that another one shall."""
+        name, how = TopicName(str(request.get("topic", ""))), request.get("how")
+        holding = self._bridge.holding
+        if how is None:
+            return {"held": holding.to_json()}
+        if how not in WORDS:
+            raise UsageError(f"{str(how)[:40]!r} is none of {', '.join(WORDS)}")
+        return {"topic": name, **await holding.take(name, str(how))}
 
     def _local(self, request: Json) -> TopicName:
         """The topic of a request by its local name, which may be given by the global one. What only comes in here is

@@ -8,9 +8,11 @@ from typing import Final
 
 from sern_client.actions import GoalWatch
 from sern_client.durable import DurableTopics
+from sern_client.e_stop import EStops
 from sern_client.endpoints.base import Difference, Sink, Subscription
 from sern_client.entry import Entry
 from sern_client.frames import Rewrite
+from sern_client.holding import Holding
 from sern_client.leaving import Leaving
 from sern_client.site import CAPPED, Site
 from sern_client.stored_topics import StoredTopics
@@ -97,6 +99,10 @@ class Outbound:
         """Those of the session, by global name, in the relay's words."""
         self.reckoned = 0
         """Poses that were not sent, because whoever receives them is right without."""
+        self.holding: Holding | None = None
+        """Who of several operators sends commands; None: all do."""
+        self.e_stops: EStops | None = None
+        """What is to be told of messages of its topics; None: this site has no e-stop."""
         self.summaries = Summaries(self._sender, site.parts)
         self.leaving = Leaving(self._unpublish)
         self._site = site
@@ -218,6 +224,10 @@ class Outbound:
             sink = self._reckoned(info, sink)
         if self._goals is not None:
             sink = self._goals.outgoing(info, channel, sink)
+        if self.holding is not None and resolved.hold_lapse_s is not None:
+            sink = self._withheld(channel, sink, self.holding)
+        if self.e_stops is not None and info.name in self.e_stops.topics:
+            sink = self._watched(info, sink, self.e_stops)
         return channel, source, Entry(sink, channel, send if sink is plain else None)
 
     # --- other rules ------------------------------------------------------------------------------------------------
@@ -368,6 +378,26 @@ class Outbound:
         rewrite = self._site.frames.outgoing(info)
         keep = durable.sender(channel, self._send(channel, None, forced=True), self.stored.of(info))
         return lambda body, stamp_ns: keep(body if rewrite is None else rewrite(body), stamp_ns, None)
+
+    def _withheld(self, channel: OutChannel, sink: Sink, holding: Holding) -> Sink:
+        """What sends commands while no other operator holds their topic."""
+        name = channel.stream.id.topic
+        holding.follow(name)
+
+        def withheld(body: bytes, stamp_ns: int) -> bool:
+            if holding.withholds(name):
+                self._core.drop(channel, len(body), DropReason.NOT_HOLDER, now=clock.now())
+                return True
+            return sink(body, stamp_ns)
+
+        return withheld
+
+    def _watched(self, info: TopicInfo, sink: Sink, e_stops: EStops) -> Sink:
+        def watched(body: bytes, stamp_ns: int) -> bool:
+            e_stops.heard(info, body, where="this site")
+            return sink(body, stamp_ns)
+
+        return watched
 
     def _reckoned(self, info: TopicInfo, sink: Sink) -> Sink:
         from sern_client.reckoned import ReckonedPoses  # who does not ask for it need not load it

@@ -127,6 +127,8 @@ class Settings:
         restart = [key for key in different if key not in RELOADED]
         if (file.adaptation is None) != (self._started.adaptation is None):
             restart.append("adaptation")
+        if _e_stops(file) != _e_stops(self._started):
+            restart.append("e_stop")
         self._have(kept, profile, file=file)
         return Reloaded(tuple(restart), tuple(ended))
 
@@ -204,6 +206,11 @@ def _place(sections: Sequence[TopicSection], name: TopicName, type_name: str) ->
 def _section_of(file: ClientFile, name: TopicName) -> TopicSection | None:
     """The section of a topic, as far as its name tells."""
     return next((section for section in file.topics if section.rule().match.fullmatch(name)), None)
+
+
+def _e_stops(file: ClientFile) -> dict[str, object]:
+    """What latches at this client: none comes or goes while it runs."""
+    return {section.match: section.e_stop for section in file.topics if section.e_stop is not None}
 
 
 def _says(section: TopicSection | None, key: str) -> object:

@@ -14,7 +14,7 @@ from sern_tools.echo import echo
 from sern_tools.events import events
 from sern_tools.explain import explain
 from sern_tools.lab.cli import app as lab_app
-from sern_tools.operate import set_command
+from sern_tools.operate import release_command, set_command, take_command
 from sern_tools.recover import recover
 from sern_tools.top import top
 from sern_tools.topics import topics
@@ -49,6 +49,8 @@ app.command()(topics)
 app.command()(clients)
 app.command()(events)
 app.command("set")(set_command)
+app.command("release")(release_command)
+app.command("take")(take_command)
 app.command()(echo)
 app.command()(explain)
 app.command()(recover)

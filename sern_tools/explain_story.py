@@ -64,6 +64,8 @@ ADVICE: Final[Mapping[str, str]] = {
     DropReason.QUEUE_FULL: "see access.max_queue_bytes in the relay's file",
     DropReason.REFUSED: "the link has not carried it away: a thinner topic, or a larger max_queue_bytes",
     DropReason.STORAGE: "make room where the recording goes",
+    DropReason.E_STOP: "release it by name where that is safe (sern release)",
+    DropReason.NOT_HOLDER: "take it over (sern take)",
     DropReason.TOO_SLOW: "thin it, send a summary of it (docs/summaries.md), or give it a longer lifespan_s",
 }
 """What to do about it, by the reason of what is held or dropped now."""

@@ -88,6 +88,59 @@ def _done(answer: dict[str, Any]) -> str:
     return f"{answer['topic']}  {_words(answer['set'])}{waits}"
 
 
+def release_command(
+    topic: Annotated[str, typer.Argument(help="This client's e-stop, or another site's by its global name.")],
+    client: Client = None,
+) -> None:
+    """Release an e-stop that is latched, so that commands are obeyed again. Look at the robot first.
+
+    Who may release the e-stop of another site is who may publish it there (the relay's access rules).
+
+    Exit code 0 when it is done, 1 when it could not be, 2 for wrong usage.
+    """
+    try:
+        answer = ask(socket_of(client), {"do": "release", "topic": topic})
+    except SernError as error:
+        raise typer.Exit(say("sern release", error)) from None
+    done = f"{answer['at']} was told to release it" if answer["at"] else "released"
+    print(f"{answer['topic']}  {done}")
+
+
+def take_command(
+    topic: Annotated[
+        str | None, typer.Argument(help="The command topic, by its global name; none: who holds what.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Take it, whoever holds it.")] = False,
+    give: Annotated[bool, typer.Option("--give", help="Give it to who has asked for it first, or to nobody.")] = False,
+    client: Client = None,
+) -> None:
+    """Take command of a robot over from another operator, or give it.
+
+    Who holds it now is said first. Without --force it is asked for: the holder's site is told (`sern events`, its log),
+    and has 15 s to give it. Nobody holds it who has sent no command for a while (holder.lapse_s in the robot's file).
+
+    Exit code 0 when it is done, 1 when it was not given or its robot is not there, 2 for wrong usage.
+    """
+    try:
+        if force and give:
+            raise UsageError("--force and --give are one too many")
+        path = socket_of(client)
+        held = ask(path, {"do": "take", "topic": topic, "how": None})["held"]
+        for name, said in sorted(held.items()):
+            if topic is None or name == topic:
+                asked = f", asked for by {', '.join(said['asked'])}" if said["asked"] else ""
+                print(f"{name}  held by {said['holder'] or 'nobody'}{asked}", flush=True)
+        if topic is None:
+            if not held:
+                print("no command topic with `holder` is known here")
+            return
+        how = "force" if force else "give" if give else "ask"
+        answer = ask(path, {"do": "take", "topic": topic, "how": how})
+    except SernError as error:
+        raise typer.Exit(say("sern take", error)) from None
+    print(f"{answer['topic']}  held by {answer['holder'] or 'nobody'} now")
+
+
 def set_command(
     topic: Annotated[
         str | None, typer.Argument(help="A topic that this client sends; nothing: list what is set.")

@@ -58,6 +58,12 @@ class AccessRule:
     max_queue_bytes: int | None = DEFAULT_QUEUE_BYTES
 
 
+ASKING: Final = ("/take", "/release")
+"""Topics below a command or an e-stop, on which it is asked to hold or to release it."""
+HOLDER: Final = "/holder"
+"""The topic below a command on which its robot says who holds it."""
+
+
 class ClientLimits(NamedTuple):
     """Limits of one client; None: unlimited."""
 
@@ -156,10 +162,20 @@ class AccessTable:
             return False
         granted = self._granted(client)
         if right is Right.PUBLISH:
-            return granted.publish.fullmatch(topic)
+            return granted.publish.fullmatch(topic) or self._asks(granted, topic)
         if not granted.subscribe.fullmatch(topic):
-            return False
+            if topic.endswith(HOLDER) and granted.publish.fullmatch(topic.removesuffix(HOLDER)):
+                return True  # who may publish the commands is told who holds them
+            return right is Right.SUBSCRIBE and self._is_asked(granted, topic)
         return right is Right.SUBSCRIBE or granted.replay.fullmatch(topic)
+
+    def _asks(self, granted: _Grants, topic: TopicName) -> bool:
+        """Who may publish a command may ask to hold it, and who may publish an e-stop may ask to release it."""
+        return any(granted.publish.fullmatch(topic.removesuffix(word)) for word in ASKING if topic.endswith(word))
+
+    def _is_asked(self, granted: _Grants, topic: TopicName) -> bool:
+        """Who gets the commands gets what is asked of them."""
+        return any(granted.subscribe.fullmatch(topic.removesuffix(word)) for word in ASKING if topic.endswith(word))
 
     def _granted(self, client: ClientName) -> _Grants:
         granted = self._grants.get(client)

@@ -94,6 +94,11 @@ class CommandLease:
             until_s = min(until_s, now + self.period_s + self._ramp.hold_s)
         self._next_s = until_s
 
+    def halt(self, *, now: float) -> None:
+        """The robot is told to stand now. That is said again once, in case it was lost, unless a command comes."""
+        self._expired_s, self._since_s, self._ramp_s, self._command = now, None, 0.0, None
+        self._next_s = now + REPEAT_S
+
     @property
     def period_s(self) -> float:
         """The usual time between commands, as they were born; 0: not known. It is the median: some are lost on their

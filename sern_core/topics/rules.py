@@ -126,6 +126,7 @@ class TopicRule:
     many_writers: bool | None = None
     remap: TopicName | None = None
     lease: Lease | None = None
+    hold_lapse_s: float | None = None
     compression: Compression | None = None
     summaries: tuple[SummarySpec, ...] = ()
     too_large: TooLarge = TooLarge.SUMMARY
@@ -155,7 +156,7 @@ class ResolvedTopic:
 
     `name` is the local name after `remap`: the one to give to `to_global`. `merge_tf`: it carries transforms, to be
     merged on their way out. `dead_reckoning`: it carries poses, and those go out that a twin would be wrong
-    without.
+    without. `hold_lapse_s`: one operator at a time commands by it, who may be silent for so long.
     """
 
     spec: TopicSpec
@@ -166,6 +167,7 @@ class ResolvedTopic:
     summaries: tuple[SummarySpec, ...] = ()
     merge_tf: bool = False
     dead_reckoning: bool = False
+    hold_lapse_s: float | None = None
 
 
 class RuleError(UsageError):
@@ -288,7 +290,9 @@ class RuleSet:
             max_rate_hz=rule.max_rate_hz,
             retention_s=self._retention_s(rule),
             max_queue_bytes=rule.max_queue_bytes,
-            many_writers=many_writers if rule.many_writers is None else rule.many_writers,
+            many_writers=many_writers or rule.hold_lapse_s is not None
+            if rule.many_writers is None
+            else rule.many_writers,
             compression=rule.compression,
             lossy=rule.lossy,
             lossy_params=rule.lossy_params,
@@ -304,7 +308,8 @@ class RuleSet:
         if not summaries and rule.too_large is TooLarge.SUMMARY:
             summaries = stand_ins(info, spec)
         reckoned = rule.dead_reckoning and plain_type(info.type_name) == ODOMETRY_TYPE
-        return ResolvedTopic(spec, rule.direction, name, rule.lease, index, summaries, merge_tf, reckoned)
+        held = rule.hold_lapse_s
+        return ResolvedTopic(spec, rule.direction, name, rule.lease, index, summaries, merge_tf, reckoned, held)
 
     def _retention_s(self, rule: TopicRule) -> float:
         if rule.retention_s is not None:

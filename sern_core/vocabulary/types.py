@@ -91,6 +91,8 @@ class DropReason(StrEnum):
     FAULT = "fault"  # an error of the program where it was taken; it may have been acted on in part
     STORAGE = "storage"  # the recording could not take it: disk full or gone
     TOO_SLOW = "too_slow"  # the link is too slow for it to arrive whole within the topic's lifespan
+    E_STOP = "e_stop"  # a command, while an e-stop is latched at the robot
+    NOT_HOLDER = "not_holder"  # a command of an operator who does not hold its topic
 
 
 _UNUSED_CODE: Final = 14  # a stream that comes back to its origin is not wanted there: no message is dropped for that

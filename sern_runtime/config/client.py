@@ -183,6 +183,23 @@ class LossSection(Section):
         return Lease(self.publish, self.after_s, ramp)
 
 
+class HolderSection(Section):
+    """Of several operators that send a command topic one holds it: `sern take` (docs/driving.md)."""
+
+    lapse_s: Annotated[float, Field(ge=0.5, le=600)] = 5.0
+    """Without a command of the holder for so long nobody holds it. What the robot's file says counts."""
+
+
+class EStopSection(Section):
+    """A message of this topic is an emergency stop: a std_msgs/Bool that is true, or any message of another type."""
+
+    stops: tuple[Pattern, ...] = ("/cmd_vel",)
+    """Topics (local names) whose commands of other sites are refused until it is released, by `sern release`."""
+    file: PathText | None = None
+    """Where it is kept that it is latched; null: NAME.e_stop in the unit's state directory, else beside this file. All
+    e-stops of a client have the same."""
+
+
 _COMMAND: Final = re.compile("cmd|command|joy|teleop|twist", re.IGNORECASE)
 """What the names of command topics have in them."""
 _COMMAND_TYPE: Final = re.compile("Twist|AckermannDrive|JointJog|JointTrajectory")
@@ -248,6 +265,12 @@ class TopicSection(Section):
     """Several clients may publish this global name; null: only /tf and /tf_static."""
     remap: TopicText | None = None
     """Another name for this topic outside this site, before the namespace; needs a plain name in `match`."""
+    e_stop: EStopSection | None = None
+    """Its messages, from here or from elsewhere, latch an emergency stop at this client; needs a plain name in
+    `match`. What is released by name stays released."""
+    holder: HolderSection | None = None
+    """One operator at a time commands by this topic, `many_writers` then being true: in the robot's file, with a plain
+    name in `match`, and in the files of operators."""
     on_link_loss: LossSection | None = None
     """What to publish when commands stop, for topics of type geometry_msgs/Twist or TwistStamped that come in."""
     summary: OneOrMoreSummaries = ()
@@ -312,6 +335,12 @@ class TopicSection(Section):
             ):
                 if given:
                     raise fault(why, key)
+        if self.holder is not None and self.many_writers is False:
+            raise fault("is of several operators' topics; leave many_writers out", "holder")
+        if self.holder is not None and self.direction is not Direction.SEND and name_problem(self.match):
+            raise fault("is of one topic of this robot: a plain name in `match`, or direction: send", "holder")
+        if self.e_stop is not None and name_problem(self.match):
+            raise fault("is of one topic, which needs a plain name in `match`", "e_stop")
         if self.on_link_loss is not None:
             if self.direction is Direction.SEND:
                 raise fault("acts where commands arrive; direction is send", "on_link_loss")
@@ -364,6 +393,7 @@ class TopicSection(Section):
             compression=None if self.compression == "auto" else Compression(self.compression),
             lossy=tuple(Compression(mode) for mode in self.lossy),
             lossy_params=LossyParams(self.voxel_m, self.jpeg_quality),
+            hold_lapse_s=None if self.holder is None else self.holder.lapse_s,
             lease=None if loss is None else loss.lease(),
             summaries=specs(self.summary),
             too_large=TooLarge(self.too_large),

@@ -26,6 +26,8 @@ DROPS: Final[Mapping[DropReason, str]] = {
     DropReason.UNCONFIRMED: "it was sent whole and never acknowledged: it may have arrived",
     DropReason.FAULT: "an error in the program; the daemon's log has it",
     DropReason.STORAGE: "the recording could not take it: disk full or gone",
+    DropReason.E_STOP: "an e-stop was latched at the robot",
+    DropReason.NOT_HOLDER: "another operator holds the topic",
     DropReason.TOO_SLOW: "the link is too slow for it to arrive within the topic's lifespan",
 }
 

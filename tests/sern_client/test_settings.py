@@ -108,7 +108,7 @@ def test_a_profile_is_set_and_given_back() -> None:
     site.settings.set_profile("mapping")
     adaptation = site.used[-1].adaptation
     assert adaptation is not None and (adaptation.profile, adaptation.interval_s) == ("mapping", 2.0)
-    with pytest.raises(UsageError, match="profile: 'racing' is not accepted .*; accepted: teleoperation, mapping"):
+    with pytest.raises(UsageError, match=r"profile: 'racing' is not accepted .*; accepted: teleoperation, mapping"):
         site.settings.set_profile("racing")
     site.settings.set_profile(None)
     assert site.used[-1] == site.used[0] and site.settings.profile is None

@@ -171,3 +171,22 @@ def test_guard_never_passes_more_than_the_rate_allows(
         assert passed <= rate_hz * now + max(1.0, rate_hz) + 1e-6
         if not admitted:
             assert guard.ready_in_s(size_bytes, now=now + wait_s + 1e-9) <= 1e-6
+
+
+def test_who_may_command_may_ask_and_is_told_and_nobody_else() -> None:
+    site, robot, other = ClientName("site1"), ClientName("robot1"), ClientName("other")
+    table = AccessTable(
+        [
+            AccessRule(client=site, publish=("/robot1/cmd_vel",), subscribe=("/robot1/pose",)),
+            AccessRule(client=robot, publish=("/robot1/.*",), subscribe=("/robot1/cmd_vel",)),
+        ]
+    )
+    for below in ("/take", "/release"):
+        asked = TopicName(f"/robot1/cmd_vel{below}")
+        assert table.may_publish(site, asked) and table.may_subscribe(robot, asked)
+        assert not table.may_publish(other, asked) and not table.may_subscribe(site, asked)
+        assert not table.may_publish(site, TopicName(f"/robot1/pose{below}"))
+        assert not table.may_replay(robot, asked)
+    holder = TopicName("/robot1/cmd_vel/holder")
+    assert table.may_subscribe(site, holder) and table.may_replay(site, holder) and not table.may_publish(site, holder)
+    assert not table.may_subscribe(other, holder)

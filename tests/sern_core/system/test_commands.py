@@ -9,6 +9,7 @@ import pytest
 
 from sern_core.bodies.twist import TwistBody
 from sern_core.link.link import Link
+from sern_core.site.hold import Hold
 from sern_core.site.lease import STEP_S, CommandLease
 from sern_core.topics.rules import Ramp
 from sern_core.vocabulary.message import Message, StreamInfo, TopicInfo
@@ -159,3 +160,36 @@ def test_of_commands_that_come_together_the_newest_is_obeyed_and_the_others_are_
     assert counted.by_reason[DropReason.SUPERSEDED] == superseded + 3
     scene.world.run(1.0)
     scene.world.validate()
+
+
+def test_the_hold_of_an_operator_whose_link_is_gone_lapses_and_whoever_was_refused_asks_for_it() -> None:
+    """Two operators; the robot keeps who holds it, as a site's bridge does. Anna's link is gone from 10 s on."""
+    world, topic = World().watch(), TopicName(TOPIC)
+    away = LinkModel(delay_s=0.05, blackouts=(Window(10.0, 1000.0),)).as_stream()
+    anna, bert = world.client("anna", away), world.client("bert")
+    robot = world.client("robot", patterns=[TOPIC])
+    hold, obeyed, began_s = Hold(5.0), list[tuple[float, str]](), world.now
+    holders: list[str | None] = []
+
+    def command(stream: StreamInfo, _message: Message, *, now: float) -> DropReason | None:
+        if not hold.command(stream.id.origin, now=now):
+            return DropReason.NOT_HOLDER
+        obeyed.append((world.now - began_s, stream.id.origin))
+        return None
+
+    robot.message = command  # type: ignore[method-assign, assignment]
+    kind = spec(PriorityClass.CONTROL, lifespan_s=LIFESPAN_S, many_writers=True)
+    for operator in (anna, bert):
+        channel = operator.core.publish(TopicInfo(topic, "a/b", Encoding.CDR), kind, now=operator.now)
+        operator.every(PERIOD_S, channel, b"go", first_s=1.0 if operator is anna else 2.0)
+    world.run(30.0)
+    last = max(at_s for at_s, _who in obeyed)
+    assert {who for _at_s, who in obeyed} == {"anna"} and 9.5 < last < 10.5
+    holders.append(hold.holder)  # it has lapsed, and he goes on saying something
+    counted = robot.core.received.topics[topic]
+    assert counted.by_reason[DropReason.NOT_HOLDER] > 500 and counted.delivered == len(obeyed)
+    hold.ask(bert.name, now=robot.now)
+    world.run(1.0)
+    holders.append(hold.holder)
+    assert holders == [None, "bert"] and obeyed[-1][1] == "bert"
+    world.validate()
