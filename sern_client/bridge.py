@@ -15,10 +15,12 @@ from sern_client.inbound import Inbound
 from sern_client.outbound import Outbound
 from sern_client.services import ServiceBridge
 from sern_client.site import Site
+from sern_client.spool.spool import Spool
 from sern_core.link.handshake import DISPLACED
 from sern_core.site.client import ClientCore, ClientEvents
 from sern_core.site.services import parse as parse_service
 from sern_core.topics.rules import Discovery, RuleSet
+from sern_core.topics.spool_names import parse as parse_spooled
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.key_news import RelayKeys
 from sern_core.vocabulary.message import Message, StreamInfo
@@ -48,7 +50,7 @@ class Bridge:
     """`ClientEvents` of the core that `make_core` makes. `outbound` is told by the endpoint which topics there are.
 
     `make_services` is given where there are rules for services, `goals` where there are rules for actions of ROS 1,
-    `make_durable` where there is a place for durable topics.
+    `make_durable` where there is a place for durable topics, `make_spool` where messages are kept or fetched.
     """
 
     def __init__(
@@ -62,14 +64,17 @@ class Bridge:
         guard: Guard | None = None,
         goals: GoalWatch | None = None,
         make_durable: Callable[[ClientCore], DurableTopics] | None = None,
+        make_spool: Callable[[ClientCore], Spool] | None = None,
         withdraws: bool = False,
     ) -> None:
         self._shell = shell
         self.site = site
         self.core = make_core(self)
         self.durable = None if make_durable is None else make_durable(self.core)
-        self.outbound = Outbound(site, self.core, discovery, goals=goals, durable=self.durable)
-        self.inbound = Inbound(site, self.core, guard=guard, goals=goals, withdraws=withdraws)
+        self.spool = None if make_spool is None else make_spool(self.core)
+        taps, fetching = (None, None) if self.spool is None else (self.spool.taps, self.spool.fetching)
+        self.outbound = Outbound(site, self.core, discovery, goals=goals, durable=self.durable, taps=taps)
+        self.inbound = Inbound(site, self.core, guard=guard, goals=goals, withdraws=withdraws, fetching=fetching)
         self.asking = Asking(site, self.core, self.outbound.refused.get)
         """Requests of other clients, and to them."""
         self.holding = Holding(site, self.core, self.asking, partial(self.inbound.subscribed.add, "asking"))
@@ -133,7 +138,12 @@ class Bridge:
     # --- of streams from elsewhere ----------------------------------------------------------------------------------
 
     def stream_opened(self, stream: StreamInfo) -> None:
-        if self.asking.takes(stream.id.topic):
+        spooled = parse_spooled(stream.id.topic)
+        if spooled is not None:
+            if self.spool is None:
+                raise ConfigError(f"{stream.id.topic} is of what was kept of a topic; no `spool` here")
+            self.spool.stream_opened(stream, spooled)
+        elif self.asking.takes(stream.id.topic):
             self.asking.opened(stream)
         elif parse_service(stream.id.topic) is None:
             self.inbound.stream_opened(stream)
@@ -145,11 +155,15 @@ class Bridge:
     def stream_closed(self, stream: StreamInfo) -> None:
         if self.services is not None:
             self.services.stream_closed(stream)
+        if self.spool is not None:
+            self.spool.stream_closed(stream)
         self.inbound.stream_closed(stream)
 
     def message(self, stream: StreamInfo, message: Message, *, now: float) -> DropReason | None:
         if stream.id in self.inbound.streams:
             return self.inbound.message(stream, message, now=now)
+        if self.spool is not None and self.spool.message(stream, message):
+            return None
         if self.asking.takes(stream.id.topic):
             self.asking.message(stream, message)
         elif self.services is not None:
@@ -157,9 +171,13 @@ class Bridge:
         return None
 
     def expired(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
+        if self.spool is not None:
+            self.spool.expired(stream)
         self.inbound.expired(stream, seq, reason)
 
     def skipped(self, stream: StreamInfo, count: int) -> None:
+        if self.spool is not None:
+            self.spool.expired(stream)
         self.inbound.skipped(stream, count)
 
     def undecodable(self, stream: StreamInfo, problem: str) -> None:

@@ -10,6 +10,7 @@ from sern_client.endpoints.base import CountingEndpoint, MeasuredEndpoint
 from sern_client.guard import Guard
 from sern_client.link_state import LinkState
 from sern_client.operating import Operating
+from sern_client.spool.spool import register_spool
 from sern_client.summaries.client_summaries import register_summaries
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.collector import CollectorWatch
@@ -56,6 +57,7 @@ def _register_link(metrics: Metrics, parts: Counting) -> None:
     register_codecs(metrics, core.coder)
     parts.link_state.register(metrics)
     register_durable(metrics, None if bridge.durable is None else bridge.durable.disk)
+    register_spool(metrics, bridge.spool)
     parts.errors.register(metrics)
     parts.collector.register(metrics)
     register_summaries(metrics, bridge.outbound.summaries)

@@ -42,6 +42,7 @@ from sern_client.scene.making import make_scene
 from sern_client.services import ServiceBridge
 from sern_client.site import Site
 from sern_client.site_objects import CoreObjects
+from sern_client.spool.spool import Spool
 from sern_client.tables import Tables
 from sern_client.views import ClientViews
 from sern_core.bodies.lossy import missing
@@ -111,7 +112,16 @@ class ClientDaemon:
         self.errors = InternalErrors()
         self.collector = CollectorWatch()
         self.parts = OptionalParts(
-            "adaptation", "codecs", "frames", "http", "link_state", "message_log", "metrics", "scene", "summaries"
+            "adaptation",
+            "codecs",
+            "frames",
+            "http",
+            "link_state",
+            "message_log",
+            "metrics",
+            "scene",
+            "spool",
+            "summaries",
         )
         self.message_log = MessageLog(loaded.resolve(model.message_log)) if model.message_log else None
         self.events = EventLog()
@@ -142,6 +152,7 @@ class ClientDaemon:
             guard=self.guard,
             goals=self._make_goals(),
             make_durable=self._durable(),
+            make_spool=self._make_spool(),
             withdraws=state.withdraw_after_s is not None,
         )
         self.core = self.bridge.core
@@ -224,6 +235,14 @@ class ClientDaemon:
             return None
         disk = Disk.within(self.loaded.resolve(section.directory), max_bytes=section.max_bytes)
         return lambda core: DurableTopics(disk, core=core, now=clock.now)
+
+    def _make_spool(self) -> Callable[[ClientCore], Spool] | None:
+        """What makes the spool; None: nothing is kept here or fetched."""
+        section = self.loaded.model.spool
+        if section is None:
+            return None
+        directory = self.loaded.resolve(section.directory)
+        return lambda core: Spool(core, self.site, section, directory)
 
     def _rule_of(self, info: TopicInfo) -> TopicSpec:
         """How a topic of this site is treated, by its global name."""
@@ -347,6 +366,9 @@ class ClientDaemon:
         if self.bridge.durable is not None:  # before the endpoint, whose topics go on where they were
             with blamed_on(self.loaded.path, "durable", "directory"):
                 self.bridge.durable.start(self._rule_of)
+        if self.bridge.spool is not None:  # before the endpoint, whose topics it keeps
+            with blamed_on(self.loaded.path, "spool", "directory"):
+                self.bridge.spool.start()
         # Before the transport: streams from the relay are advertised at the endpoint as soon as there is a session.
         events = self.bridge.outbound if self.scene is None else BothTold(self.bridge.outbound, self.scene)
         await self.site.endpoint.start(events)
@@ -421,6 +443,9 @@ class ClientDaemon:
             self.bridge.holding.look()
             if self.bridge.durable is not None:
                 self.bridge.durable.look()
+            if self.bridge.spool is not None:
+                with self.parts.survive("spool"):
+                    self.bridge.spool.look()
             if watchdog.interval_s is not None:
                 watchdog.check()
             self.news.look()
@@ -499,6 +524,7 @@ class ClientDaemon:
             json_routes={
                 **self.views.routes(),
                 "/api/keys": lambda: {} if self.keyring is None else self.keyring.to_json(),
+                **({} if self.bridge.spool is None else {"/api/spool": self.bridge.spool.to_json}),
                 **({} if self.scene is None else {"/api/scene": self.scene.to_json}),
                 **({} if adaptation is None else {"/api/mmcf": adaptation.view()}),
                 **(self.site.endpoint.json_routes if isinstance(self.site.endpoint, ServedEndpoint) else {}),
@@ -578,6 +604,8 @@ class ClientDaemon:
                 stack.push_async_callback(self.guard.stop)
             if self.scene is not None:
                 stack.callback(self.scene.close)
+            if self.bridge.spool is not None:
+                stack.push_async_callback(self.bridge.spool.close)
             stack.callback(self.bridge.close)
             if self.on_demand is not None:
                 stack.callback(self.on_demand.close)

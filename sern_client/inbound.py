@@ -18,12 +18,14 @@ from sern_client.guard import Guard
 from sern_client.keeping import Keeping
 from sern_client.rebuild import Rebuilds
 from sern_client.site import Site
+from sern_client.spool.fetching import SpoolFetching
 from sern_client.subscribed import Subscribed
 from sern_client.update_topics import UpdateTopics
 from sern_client.withdrawal import Kept, Withdrawable, Withdrawal
 from sern_core.site.client import ClientCore
 from sern_core.site.services import parse as parse_service
 from sern_core.topics.rules import ResolvedTopic
+from sern_core.topics.spool_names import parse as parse_spooled
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.ledger import MAX_TOPICS, OTHER_TOPIC
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo
@@ -86,6 +88,7 @@ class Inbound:
 
     `guard` publishes stop commands while this process cannot. `goals`: those of ROS 1 that this site gives to others.
     `withdraws`: topics of an origin that is not there may be ended (`withdrawal`), so what is latched in them is kept.
+    `fetching`: what fetches what did not come; it must know what did.
     """
 
     def __init__(
@@ -96,6 +99,7 @@ class Inbound:
         guard: Guard | None = None,
         goals: GoalWatch | None = None,
         withdraws: bool = False,
+        fetching: SpoolFetching | None = None,
     ) -> None:
         self.ages = AgeHistograms()
         self.subscription_problems: dict[str, str] = {}
@@ -111,6 +115,7 @@ class Inbound:
         self._site = site
         self._core = core
         self._goals = goals
+        self._fetching = fetching
         self._closed = False
         self._streams: dict[StreamId, Incoming] = {}
         self.withdrawal = Withdrawal(self._streams, self._advertise, self._close_publisher, used=withdraws)
@@ -273,12 +278,15 @@ class Inbound:
         if incoming.commands:
             self.commands.renew(stream.id, self._local(incoming, message.body), born_s=message.born_s, now=now)
         mark = self.keeping.mark() if stream.spec.reliable and self.keeping else None
+        fetched = None if self._fetching is None else self._fetching.mark(stream.id)
         if not self.rebuilds.message(stream, message, owed=mark is not None):
             lifespan_s = stream.spec.lifespan_s
             left_s = inf if lifespan_s is None else max(lifespan_s - age_s, 0.0)
             if incoming.aged is not None:
                 incoming.aged(age_s)
             self._show(incoming, message.body, message.stamp_ns, left_s)
+        if fetched is not None and self._fetching is not None:
+            self._fetching.published(stream.id, message.seq, fetched)
         if mark is None:
             pass
         elif self.rebuilds.owes(stream, message.seq):
@@ -395,6 +403,7 @@ class Inbound:
     def validate(self) -> list[Difference]:
         """Compare our table with the core's: what is not as it should be."""
         opened = {stream for stream in self._core.opened if parse_service(stream.topic) is None}
+        opened = {stream for stream in opened if parse_spooled(stream.topic) is None}
         streams = {stream for stream in opened if not self.elsewhere(stream.topic)}
         halves = (("the core", streams - self._streams.keys()), ("the bridge", self._streams.keys() - streams))
         return [

@@ -15,6 +15,7 @@ from sern_client.frames import Rewrite
 from sern_client.holding import Holding
 from sern_client.leaving import Leaving
 from sern_client.site import CAPPED, Site
+from sern_client.spool.keeping import Taps
 from sern_client.stored_topics import StoredTopics
 from sern_client.summaries.client_summaries import Summaries
 from sern_client.summaries.source import Source, streams_of
@@ -82,7 +83,7 @@ def _without_birth(send: Callable[[bytes, int, float | None], bool]) -> Sink:
 class Outbound:
     """`TopicEvents` of the endpoint. The core's news of our own streams come to it as well. `goals`: those of ROS 1
     that this site gives to others, where there are rules for them; `durable`: what keeps topics on disk, where there is
-    a place for them."""
+    a place for them; `taps`: of topics that are kept whether they are sent or not, where there are such."""
 
     def __init__(
         self,
@@ -92,6 +93,7 @@ class Outbound:
         *,
         goals: GoalWatch | None = None,
         durable: DurableTopics | None = None,
+        taps: Taps | None = None,
     ) -> None:
         self.refusals = 0
         """Publications that the relay did not take."""
@@ -110,6 +112,7 @@ class Outbound:
         self._discovery = discovery
         self._goals = goals
         self._durable = durable
+        self._taps = taps
         self.stored = StoredTopics(site.advertise)
         """What says of durable topics how much of them is on disk."""
         self._stopped = False
@@ -228,6 +231,8 @@ class Outbound:
             sink = self._withheld(channel, sink, self.holding)
         if self.e_stops is not None and info.name in self.e_stops.topics:
             sink = self._watched(info, sink, self.e_stops)
+        if self._taps is not None and self._spooled(info.name, resolved, info.encoding):
+            sink = self._taps.open(channel, rewrite, sink)
         return channel, source, Entry(sink, channel, send if sink is plain else None)
 
     # --- other rules ------------------------------------------------------------------------------------------------
@@ -317,10 +322,18 @@ class Outbound:
             if self._goals is not None:
                 self._goals.withdrawn(name)
             outgoing.subscription.close()
+            if self._taps is not None:
+                self._taps.close(outgoing.channel.stream.id)
             self.stored.close(name)
             self._forget_source(outgoing.source)
             self.leaving.leave(name, *streams_of(outgoing.channel, outgoing.source), now=clock.now())
             self._site.kick()
+
+    def _spooled(self, name: TopicName, resolved: ResolvedTopic, encoding: Encoding) -> bool:
+        """Whether all messages of a topic are kept. Of a durable one none is ever dropped, and bodies that are no ROS
+        messages no recording holds."""
+        known = self._taps is not None and self._taps.wants(name)
+        return known and not resolved.spec.durable and encoding is not Encoding.RAW
 
     def _say_unnamed(self, info: TopicInfo) -> None:
         """Said once for each name: a rule with a typing error looks like a robot without the topic."""
@@ -331,6 +344,8 @@ class Outbound:
 
     def _withdraw(self, channel: OutChannel, source: Source | None) -> None:
         """Offer a topic no more."""
+        if self._taps is not None:
+            self._taps.close(channel.stream.id)
         self._forget_source(source)
         for each in streams_of(channel, source):
             self._unpublish(each)
@@ -415,15 +430,17 @@ class Outbound:
         self, channel: OutChannel, rewrite: Rewrite | None, *, forced: bool = False
     ) -> Callable[[bytes, int, float | None], bool]:
         core, kick, log, stream, parts = self._core, self._site.kick, self._site.log, channel.stream, self._site.parts
-        passed = self._site.values.passed
+        passed, taps = self._site.values.passed, self._taps
 
         def send(body: bytes, stamp_ns: int, born_s: float | None) -> bool:
-            seq = channel.next_seq
+            seq, offered = channel.next_seq, body
             if rewrite is not None:
                 body = rewrite(body)
             accepted = core.send(channel, body, stamp_ns, born_s=born_s, now=clock.now(), forced=forced)
             if accepted:
                 passed(stream, seq, body)
+                if taps is not None:
+                    taps.sent(stream.id, seq, offered, body)
             if log is not None:
                 try:
                     log.offered(stream, seq, body, stamp_ns, accepted=accepted)
@@ -444,12 +461,13 @@ class Outbound:
         if outgoing is None:
             return
         endpoint, source = self._site.endpoint, outgoing.source
+        kept = self._taps is not None and self._taps.taken(outgoing.channel.stream.id)  # whoever wants it
         if source is None:
-            endpoint.interest(outgoing.name, wanted)
+            endpoint.interest(outgoing.name, wanted or kept)
             return
         if wanted:
             source.audience_changed()
-        endpoint.interest(outgoing.name, source.wanted)
+        endpoint.interest(outgoing.name, source.wanted or kept)
 
     def send_dropped(self, stream: StreamInfo, first: int, count: int, reason: DropReason, where: str) -> None:
         """Messages of ours were dropped, as `ClientEvents` says: log what somebody wanted."""

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from sern_runtime import version
-from sern_tools import check, enroll, keygen, keys
+from sern_tools import check, enroll, keygen, keys, spool
 from sern_tools.clients import clients
 from sern_tools.demo import demo
 from sern_tools.demo_navigation import demo_navigation
@@ -43,6 +43,7 @@ app.add_typer(keygen.app, name="keygen")
 app.add_typer(keys.app, name="keys")
 app.add_typer(enroll.app, name="enroll")
 app.add_typer(lab_app, name="lab")
+app.add_typer(spool.app, name="spool")
 app.command("check")(check.check_command)
 app.command()(top)
 app.command()(topics)

@@ -356,7 +356,7 @@ class KeepingEndpoint(Protocol):
         ...
 
     def watch_kept(self, told: KeptUpTo) -> None:
-        """Whom to tell; once, before `start`."""
+        """Whom to tell as well; before `start`."""
         ...
 
     def flush(self) -> None:

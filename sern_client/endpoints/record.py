@@ -130,7 +130,7 @@ class RecordEndpoint:
         self._thread: threading.Thread | None = None
         self._open = False
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._told: KeptUpTo | None = None
+        self._told: list[KeptUpTo] = []
         self._taken = 0
         self._refused: dict[int, DropReason] = {}  # numbers of what did not get into the buffer, not told of yet
         reasons = (DropReason.QUEUE_FULL, DropReason.STORAGE, DropReason.DISCONNECTED)
@@ -234,7 +234,7 @@ class RecordEndpoint:
 
     def watch_kept(self, told: KeptUpTo) -> None:
         """Whom to tell what is flushed."""
-        self._told = told
+        self._told.append(told)
 
     def flush(self) -> None:
         """Flush what was taken so far, without waiting for `flush_s`."""
@@ -267,8 +267,8 @@ class RecordEndpoint:
 
     def _tell(self, upto: int, lost: dict[int, DropReason]) -> None:
         refused, self._refused = self._refused, {}
-        if self._told is not None:
-            self._told(upto, refused | lost)
+        for told in self._told:
+            told(upto, refused | lost)
 
     def _resolve(self, path: Path) -> tuple[Path, tuple[Encoding, ...]]:
         """(stem without suffix, encodings whose file must not be in the way)."""

@@ -5,6 +5,9 @@ the general rule. A client that no rule names may do nothing.
 
 Patterns are full-match regular expressions (patterns.py). In a topic pattern `{self}` stands for the client's own name,
 literally: `/{self}/.*` grants `jackal1` what is under `/jackal1/` and nothing of `jackal10`.
+
+What was kept of a topic follows the topic's own rules (`sern_core.topics.spool_names`): who may publish it may keep it,
+who may subscribe to it and have its earlier messages may fetch them.
 """
 
 import math
@@ -14,6 +17,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, NamedTuple
 
+from sern_core.topics import spool_names
 from sern_core.topics.patterns import PatternError, PatternSet, compile_pattern
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.names import NAME_MAX_CHARS
@@ -161,6 +165,9 @@ class AccessTable:
         if len(topic) > NAME_MAX_CHARS:
             return False
         granted = self._granted(client)
+        kept = spool_names.parse(topic)
+        if kept is not None:
+            return _may_fetch(granted, right, client, kept)
         if right is Right.PUBLISH:
             return granted.publish.fullmatch(topic) or self._asks(granted, topic)
         if not granted.subscribe.fullmatch(topic):
@@ -270,6 +277,15 @@ class RateGuard:
             min(self._messages_full, self._messages + elapsed_s * self._rate_hz),
             min(self._bytes_full, self._bytes + elapsed_s * self._bytes_per_s),
         )
+
+
+def _may_fetch(granted: _Grants, right: Right, client: ClientName, kept: spool_names.SpoolStream) -> bool:
+    """Who has which part in a stream of what was kept of a topic. Requests go the other way."""
+    sends = right is Right.PUBLISH
+    if sends is not (kept.kind is spool_names.SpoolStreamKind.FETCH):
+        return granted.publish.fullmatch(kept.topic)
+    its_own = kept.kind is spool_names.SpoolStreamKind.KEPT or kept.site == client
+    return its_own and granted.subscribe.fullmatch(kept.topic) and granted.replay.fullmatch(kept.topic)
 
 
 def with_self(text: str, client: str) -> str:

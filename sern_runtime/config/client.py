@@ -70,6 +70,7 @@ from sern_runtime.config.shared import (
     public_key_problems,
     secret_key_problems,
 )
+from sern_runtime.config.spool import SpoolSection
 from sern_runtime.config.summaries import OneOrMoreSummaries, one_or_list, specs
 from sern_runtime.config.twin import TwinEndpoint
 from sern_runtime.config.yaml import Data
@@ -538,6 +539,9 @@ class ClientFile(FileModel):
     """Actions offered to other sites and used from them."""
     durable: DurableSection | None = None
     """Where messages of durable topics are kept; null: there are no such topics."""
+    spool: SpoolSection | None = None
+    """What this site keeps of its topics whether it is sent or not, and what it fetches of what others have kept; null:
+    nothing."""
     scheduler: SchedulerSection = SchedulerSection()
     """Which message the link carries next."""
     adaptation: AdaptationSection | None = None
@@ -632,7 +636,8 @@ class ClientFile(FileModel):
         """What to ask the relay for, on global names: `subscribe`, rules with direction `receive`, and services."""
         received = self.rules().receive_patterns(self.namespace)
         services = subscriptions(self.name, self.namespace, offer=self.offered_services(), use=self.used_services())
-        return tuple(dict.fromkeys((*self.subscribe, *received, *services, *self.actions.patterns())))
+        spooled = () if self.spool is None else self.spool.subscriptions(self.name, self.namespace)
+        return tuple(dict.fromkeys((*self.subscribe, *received, *services, *self.actions.patterns(), *spooled)))
 
     def object_selections(self) -> tuple[Selection, ...]:
         """What to ask the relay for of objects: `objects`, the patches and discrepancies of the scene, and which topics
@@ -675,6 +680,8 @@ class ClientFile(FileModel):
         yield from output_problems(base_dir, self.summary, ("summary",))
         if self.durable is not None:
             yield from self.durable.problems(base_dir)
+        if self.spool is not None:
+            yield from self.spool.problems(base_dir)
 
     def _services_only_problems(self) -> Iterator[FileProblem]:
         """A warning of endpoints that leave topics to others, where there are none."""

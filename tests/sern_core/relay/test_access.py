@@ -190,3 +190,36 @@ def test_who_may_command_may_ask_and_is_told_and_nobody_else() -> None:
     holder = TopicName("/robot1/cmd_vel/holder")
     assert table.may_subscribe(site, holder) and table.may_replay(site, holder) and not table.may_publish(site, holder)
     assert not table.may_subscribe(other, holder)
+
+
+# What was kept of a topic
+
+
+KEPT = AccessTable(
+    [
+        AccessRule("robot1", publish=("/robot1/.*",)),
+        AccessRule("site1", subscribe=("/robot1/points",)),
+        AccessRule("site2", subscribe=("/robot1/.*",), replay=()),
+        AccessRule("site3", subscribe=("/robot1/odom",)),
+    ]
+)
+
+
+@pytest.mark.parametrize("client", ["robot1", "site1", "site2", "site3", "stranger"])
+@pytest.mark.parametrize("suffix", ["_kept", "_fetch/site1", "_fetched/site1", "_fetch/site3", "_fetched/robot1"])
+def test_who_may_have_a_topic_may_fetch_it_for_itself_and_nobody_else(client: str, suffix: str) -> None:
+    """The robot says what it has and answers; site1 may have the topic, site2 not its earlier messages, site3 not at
+    all. None of them sees what another one asks for or gets."""
+    name, who = TopicName(f"/robot1/points/{suffix}"), ClientName(client)
+    robot, asks = client == "robot1", suffix.startswith("_fetch/")
+    site = client == "site1" and suffix in ("_kept", "_fetch/site1", "_fetched/site1")
+    assert KEPT.may_publish(who, name) is (site if asks else robot)
+    assert KEPT.may_subscribe(who, name) is (robot if asks else site)
+    assert KEPT.may_replay(who, name) is (robot if asks else site)
+
+
+def test_a_rule_for_the_names_themselves_gives_nothing() -> None:
+    table = AccessTable([AccessRule("site1", publish=("/robot1/points/.*",), subscribe=("/robot1/points/.*",))])
+    for suffix in ("_kept", "_fetch/site1", "_fetched/site1"):
+        name = TopicName(f"/robot1/points/{suffix}")
+        assert not table.may_publish(ClientName("site1"), name) and not table.may_subscribe(ClientName("site1"), name)
