@@ -11,8 +11,8 @@ from sern_core.site.spool import Window
 from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime.ros_types import topic_info
 from sern_tools.spool_merge import Selection, merge
-from tests.daemons import Json, Lab, Process, bodies
-from tests.daemons import metric, write_bag
+from tests.daemons import Json, Lab, Process, bodies, metric
+from tests.loopback.test_durable import write_bag
 
 COUNT = 3000
 TOPIC = "/robot1/chat"
