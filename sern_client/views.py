@@ -70,7 +70,8 @@ class ClientViews:
             "summaries": outbound.summaries.to_json(now),
             "refused": dict(list(outbound.refused.items())[:MAX_TOLD]),
             "subscriptions_refused": list(inbound.subscription_problems)[:MAX_TOLD],
-            "subscribed": list(self._core.subscription.patterns),
+            # Nobody misses a request that nobody makes.
+            "subscribed": [text for text in self._core.subscription.patterns if not self._bridge.asking.takes(text)],
             "by_hand": self._by_hand(),
             "stays_here": list(outbound.unnamed)[:MAX_TOLD],
             "now_s": now,
