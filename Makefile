@@ -143,13 +143,14 @@ figures: setup
 	mkdir -p build
 	$(BIN)/python -m benchmarks.footprint --json build/footprint.json
 	$(BIN)/python -m benchmarks.thin_link --json build/thin_link.json
+	$(BIN)/python -m benchmarks.spool --json build/spool.json
 	$(BIN)/python -m benchmarks.codecs --json build/codecs.json
 	$(BIN)/python -m benchmarks.summaries --plots docs/images --json build/summaries.json
 	$(BIN)/python -m benchmarks.mmcf_recovery --json build/mmcf_recovery.json
 	$(BIN)/python -m benchmarks.mmcf_replay --plots docs/images --json build/mmcf_replay.json
 	$(BIN)/python -m benchmarks.mmcf --plots docs/images --json build/mmcf.json
 	$(BIN)/python -m benchmarks.sync --json build/sync.json
-	$(BIN)/python -m benchmarks.document $(addprefix build/,$(addsuffix .json,footprint thin_link codecs summaries mmcf_recovery mmcf_replay mmcf sync))
+	$(BIN)/python -m benchmarks.document $(addprefix build/,$(addsuffix .json,footprint thin_link spool codecs summaries mmcf_recovery mmcf_replay mmcf sync))
 
 # The recordings are not ours to ship: make cellular RECORDINGS=DIR.
 RECORDINGS := ../shared/data/cellular

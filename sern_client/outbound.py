@@ -147,6 +147,8 @@ class Outbound:
         self.stop_sources()
         self._closed = True
         for outgoing in self._topics.values():
+            if self._taps is not None:
+                self._taps.close(outgoing.channel.stream.id)
             if outgoing.source is not None:
                 outgoing.source.close()
                 for channel in outgoing.source.own:
