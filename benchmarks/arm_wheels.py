@@ -1,8 +1,8 @@
 """Which pinned dependencies come as wheels for computers with an ARM processor: `python -m benchmarks.arm_wheels`.
 
 Asks pip what it would install there of each pin, and downloads none of them (`pip install --dry-run`). The table says
-for each extra how many packages it takes, which of them have no wheel, and what glibc the others ask for. `--write`
-puts it into docs/install.md. Needs an environment with all extras (make setup), whose metadata says what depends on what.
+for each extra how many packages it takes, which of them have no wheel, and what glibc the others ask for. By `--write`
+it goes into docs/install.md. Needs an environment with all extras (make setup): its metadata says what needs what.
 """
 
 import argparse
