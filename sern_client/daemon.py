@@ -428,7 +428,11 @@ class ClientDaemon:
     # ------------------------------------------------------------------------------------------------------------------
 
     async def _tick(self) -> None:
-        watchdog = Watchdog(self.notifier, {"loop": lambda: int(clock.now() * 1e3)})
+        progress = {"loop": lambda: int(clock.now() * 1e3)}
+        if self.bridge.durable is not None:
+            disk = self.bridge.durable.disk
+            progress["store"] = lambda: disk.progress(now=clock.now())
+        watchdog = Watchdog(self.notifier, progress)
         while True:
             await asyncio.sleep(TICK_S)
             if self.message_log is not None:

@@ -291,6 +291,9 @@ class RelayDaemon:
         if self.zap is not None:
             progress["zap"] = lambda: self.zap.counters.pings if self.zap else 0
             self.zap.ping()  # answered by the first sweep, which would else take it for stuck
+        if self.durable is not None:
+            disk = self.durable.disk
+            progress["store"] = lambda: disk.progress(now=clock.now())
         watchdog = Watchdog(self.notifier, progress)
         while True:
             await asyncio.sleep(SWEEP_S)
