@@ -1,7 +1,7 @@
 """What a client tells over HTTP: the routes under /api that every client has."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Final
 
 from sern_client.bridge import Bridge
@@ -79,7 +79,10 @@ class ClientViews:
 
     def clients(self) -> dict[str, Any]:
         """The relay and the peers, in the shape of a relay's answer: what this client does not know is None."""
-        views = self._link_state.views()
+        return self.head() | {"clients": list(self.rows())}
+
+    def head(self) -> dict[str, Any]:
+        """The same without its rows."""
         return {
             "name": self._name,
             "role": "client",
@@ -88,8 +91,11 @@ class ClientViews:
             "refused": [],
             "refused_total": 0,
             "refused_gone": 0,
-            "clients": [self._relay(view) if view.own else _row(view) for view in views],
         }
+
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """The relay and the peers, each as it is when it is asked for."""
+        return (self._relay(view) if view.own else _row(view) for view in self._link_state.views())
 
     @property
     def _up(self) -> bool:
