@@ -10,7 +10,7 @@ PACKAGES := sern_core sern_runtime sern_relay sern_client sern_sim sern_twin ser
 # quarter less of CPU, and each worker of the tests would rewrite all of them anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup lint format types test wheel compiled test-compiled explore standstills soak fuzz kills lab bench performance endpoints operations figures cellular navigation picture demo demo-twin demo-navigation schemas clean
+.PHONY: help setup lint format types test wheel compiled test-compiled deb test-install arm-wheels explore standstills soak fuzz kills lab bench performance endpoints operations figures cellular navigation picture demo demo-twin demo-navigation schemas clean
 
 help:
 	@echo "make setup    create $(VENV) with pinned dependencies"
@@ -20,6 +20,8 @@ help:
 	@echo "make test     the tests but the longer ones of make lab;  make lint, make types: static checks"
 	@echo "make wheel    a wheel in dist/ whose core is compiled;  make test-compiled: the tests of the core and of the daemons on it"
 	@echo "make compiled an environment with that wheel, .venv-compiled, also for benchmarks"
+	@echo "make deb      Debian packages in dist/ with that wheel;  make test-install   as root: they install, run under systemd, and go"
+	@echo "make arm-wheels  which pinned dependencies have wheels for ARM computers, for docs/install.md"
 	@echo "make explore  the tests with random input, with new cases and ten times as many; SEED=... repeats a run"
 	@echo "make standstills   the tests whose processes stand still for moments, as on a loaded machine; SEED=..."
 	@echo "make soak     ten minutes of robots that come and go: memory and open files;  make kills: 1,000 times kill -9"
@@ -80,6 +82,18 @@ compiled: wheel
 test-compiled: compiled
 	SERN_CORE=compiled PYTHONSAFEPATH=1 PYTHONPATH=$(CURDIR)/build/checkout $(COMPILED)/bin/python -m pytest \
 		-o pythonpath=build/checkout -n $(TEST_PROCESSES) --dist loadgroup $(CORE_TESTS) tests/loopback
+
+# The Debian packages, for the Python of Debian itself: it has to be of the version of PYTHON, whose compiler made the wheel.
+deb: wheel
+	deploy/debian/build dist/sern-*.whl
+
+# Some minutes, and five more at the first time, for a Debian to install them in (.rootfs).
+test-install: deb
+	SERN_PACKAGES=dist $(BIN)/python -m pytest tests/install
+
+# Asks pip, for some minutes, and downloads nothing.
+arm-wheels: setup
+	$(BIN)/python -m benchmarks.arm_wheels --write
 
 # One look at the clock: all that takes the seed has the same one.
 SEED := $(or $(SEED),$(shell date +%s))
@@ -143,13 +157,14 @@ figures: setup
 	mkdir -p build
 	$(BIN)/python -m benchmarks.footprint --json build/footprint.json
 	$(BIN)/python -m benchmarks.thin_link --json build/thin_link.json
+	$(BIN)/python -m benchmarks.spool --json build/spool.json
 	$(BIN)/python -m benchmarks.codecs --json build/codecs.json
 	$(BIN)/python -m benchmarks.summaries --plots docs/images --json build/summaries.json
 	$(BIN)/python -m benchmarks.mmcf_recovery --json build/mmcf_recovery.json
 	$(BIN)/python -m benchmarks.mmcf_replay --plots docs/images --json build/mmcf_replay.json
 	$(BIN)/python -m benchmarks.mmcf --plots docs/images --json build/mmcf.json
 	$(BIN)/python -m benchmarks.sync --json build/sync.json
-	$(BIN)/python -m benchmarks.document $(addprefix build/,$(addsuffix .json,footprint thin_link codecs summaries mmcf_recovery mmcf_replay mmcf sync))
+	$(BIN)/python -m benchmarks.document $(addprefix build/,$(addsuffix .json,footprint thin_link spool codecs summaries mmcf_recovery mmcf_replay mmcf sync))
 
 # The recordings are not ours to ship: make cellular RECORDINGS=DIR.
 RECORDINGS := ../shared/data/cellular
@@ -187,4 +202,4 @@ schemas: setup
 	$(BIN)/python -m sern_runtime.config.export schemas docs/configuration.md
 
 clean:
-	rm -rf $(VENV) $(COMPILED) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
+	rm -rf $(VENV) $(COMPILED) build dist .rootfs *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

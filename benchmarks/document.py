@@ -28,6 +28,7 @@ DOCUMENTS: Final = {
     **dict.fromkeys(("navigation", "perception", "viewers", "curve", "durable", "soak"), DOCUMENT),
     **dict.fromkeys(("mmcf", "mmcf_replay", "mmcf_recovery"), THEORY),
     "summaries": ROOT / "docs" / "summaries.md",
+    "spool": ROOT / "docs" / "spool.md",
     "matrix": ROOT / "docs" / "lab.md",
     **dict.fromkeys(("sync", "sync_lab"), ROOT / "docs" / "twin.md"),
 }

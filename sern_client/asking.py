@@ -9,6 +9,7 @@ import logging
 from collections.abc import Callable
 from typing import Final
 
+from sern_client.endpoints.common.saying import SayOnce
 from sern_client.site import Site
 from sern_core.site.client import ClientCore
 from sern_core.stream.out_channel import OutChannel
@@ -49,6 +50,7 @@ class Asking:
         self._site = site
         self._core = core
         self._refused = refused
+        self._said = SayOnce(_log)
         self._listeners: dict[TopicName, Hear] = {}
         self._locks: dict[TopicName, asyncio.Lock] = {}
 
@@ -61,29 +63,33 @@ class Asking:
         """Have the requests on a topic (global name) heard."""
         self._listeners[topic] = hear
 
-    def takes(self, topic: TopicName) -> bool:
+    def takes(self, topic: str) -> bool:
+        """Whether requests on a topic (global name) are heard here."""
         return topic in self._listeners
 
     def opened(self, stream: StreamInfo) -> None:
         """Raises ConfigError for a stream that holds no requests."""
         if ros_types.canonical(stream.info.type_name) != TEXT_TYPE or stream.info.encoding is Encoding.RAW:
-            raise ConfigError(f"{stream.id.topic} of {stream.id.origin} is {stream.info.type_name}, not {TEXT_TYPE}")
+            problem = f"{stream.id.topic} of {stream.id.origin} is {stream.info.type_name}, not {TEXT_TYPE}"
+            self._said(f"{problem}: its requests are not heard", stream.id.topic, stream.id.origin)
+            raise ConfigError(problem)
 
     def message(self, stream: StreamInfo, message: Message) -> None:
         """A request has come. One that cannot be read is a fault of whoever sent it: said, and nothing else."""
         hear, who = self._listeners[stream.id.topic], stream.id.origin
         if len(message.body) > MAX_TEXT_BYTES:
-            _log.warning("%s: a request of %s is too long and not heard", stream.id.topic, who)
+            self._said(f"{stream.id.topic}: a request of {who} is too long and not heard", stream.id.topic, who)
             return
         try:
             text = str(ros_types.deserialise(message.body, TEXT_TYPE, stream.info.encoding).data)
         except Exception as error:  # noqa: BLE001  (whatever a peer's bytes do to the decoder)
-            _log.warning("%s: a request of %s cannot be read: %s", stream.id.topic, who, ros_types.one_line(error))
+            words = f"{stream.id.topic}: a request of {who} cannot be read: {ros_types.one_line(error)}"
+            self._said(words, stream.id.topic, who)
             return
         try:
             hear(who, text)
         except UsageError as error:
-            _log.warning("%s: a request of %s changes nothing: %s", stream.id.topic, who, error)
+            self._said(f"{stream.id.topic}: a request of {who} changes nothing: {error}", stream.id.topic, who)
 
     async def ask(self, topic: TopicName, text: str) -> None:
         """Make a request on a topic (global name); returns once it is delivered. Raises SernError, in one line, where

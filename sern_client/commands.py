@@ -88,15 +88,16 @@ class Commands:
             command.guarded = self._guard.opened(info, stop, rule.ramp)
         self._open[stream] = command
 
-    def refuses(self, stream: StreamId, *, born_s: float, now: float) -> DropReason | None:
-        """Why a command that comes now is not to be obeyed; None: it is. Ask it of every command, before `renew`."""
+    def refuses(self, stream: StreamId, local: TopicName, *, born_s: float, now: float) -> DropReason | None:
+        """Why a message that comes now, of a topic called `local` here, is not to be obeyed; None: it is. Ask it of
+        every message, also of topics without a lease, before `renew`."""
+        if self.e_stops is not None and self.e_stops.stopped(local) is not None:
+            return DropReason.E_STOP
+        if self.holding is not None and not self.holding.obeys(local, stream.origin, now=now):
+            return DropReason.NOT_HOLDER
         command = self._open.get(stream)
         if command is None:
             return None
-        if self.e_stops is not None and self.e_stops.stopped(command.info.name) is not None:
-            return DropReason.E_STOP
-        if self.holding is not None and not self.holding.obeys(command.info.name, stream.origin, now=now):
-            return DropReason.NOT_HOLDER
         if command.lease.overtaken(born_s=born_s, now=now):
             return DropReason.SUPERSEDED
         return None
@@ -127,14 +128,14 @@ class Commands:
             said = body if read is not None else None
             self._guard.commanded(command.guarded, lease.deadline(), said)
 
-    def ended(self, stream: StreamId) -> bool:
+    def ended(self, stream: StreamId, local: TopicName) -> bool:
         """No more commands will come from there: the last one must not stand. True: what it is published with is closed
         here, once the robot stands."""
+        if self.holding is not None:
+            self.holding.ended(local, stream.origin)
         command = self._open.pop(stream, None)
         if command is None:
             return False
-        if self.holding is not None:
-            self.holding.ended(command.info.name, stream.origin)
         armed = command.lease.deadline() is not None
         if armed and command.ramped and len(self._ending) < MAX_ENDING:
             before = self._ending.pop(command.info.name, None)

@@ -44,6 +44,7 @@ from sern_client.site import Site
 from sern_client.site_objects import CoreObjects
 from sern_client.spool.spool import Spool
 from sern_client.tables import Tables
+from sern_client.told import ClientTold
 from sern_client.views import ClientViews
 from sern_core.bodies.lossy import missing
 from sern_core.objects.feed import PERIOD_S
@@ -73,6 +74,7 @@ from sern_runtime.optional import OptionalParts
 from sern_runtime.sdnotify import Notifier, Watchdog
 from sern_runtime.topics_view import TopicView, both_ways
 from sern_runtime.transport_watch import NOT_YET, WAITING
+from sern_runtime.watching.live import Live
 
 if TYPE_CHECKING:
     from sern_runtime.http import HttpServer
@@ -122,6 +124,7 @@ class ClientDaemon:
             "scene",
             "spool",
             "summaries",
+            "watching",
         )
         self.message_log = MessageLog(loaded.resolve(model.message_log)) if model.message_log else None
         self.events = EventLog()
@@ -209,6 +212,7 @@ class ClientDaemon:
         self.core.subscribe_objects(model.object_selections(), now=now)
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
         self._http: HttpServer | None = None
+        self.live: Live | None = None
         self.tasks: list[asyncio.Task[None]] = []
         self._endpoint_started = False
 
@@ -390,6 +394,9 @@ class ClientDaemon:
         if self.adaptation is not None:
             kept = self.parts.keep("adaptation", self.adaptation.run, reset=self.adaptation.reset)
             self.tasks.append(asyncio.create_task(kept, name="adaptation"))
+        if self.live is not None:
+            kept = self.parts.keep("watching", self.live.run, reset=self.live.reset)
+            self.tasks.append(asyncio.create_task(kept, name="watching"))
         await self.operating.start()
         self.notifier.ready(f"{model.name} -> {relay.endpoint}")
         words = "client %s started, relay %s"
@@ -428,7 +435,11 @@ class ClientDaemon:
     # ------------------------------------------------------------------------------------------------------------------
 
     async def _tick(self) -> None:
-        watchdog = Watchdog(self.notifier, {"loop": lambda: int(clock.now() * 1e3)})
+        progress = {"loop": lambda: int(clock.now() * 1e3)}
+        if self.bridge.durable is not None:
+            disk = self.bridge.durable.disk
+            progress["store"] = lambda: disk.progress(now=clock.now())
+        watchdog = Watchdog(self.notifier, progress)
         while True:
             await asyncio.sleep(TICK_S)
             if self.message_log is not None:
@@ -499,6 +510,7 @@ class ClientDaemon:
 
     def _make_http(self, listen: str) -> "HttpServer":
         from sern_runtime.http import HttpServer
+        from sern_runtime.watching.page import add_page
 
         registry = CollectorRegistry()
         metrics = Metrics(registry)
@@ -533,6 +545,8 @@ class ClientDaemon:
             parts=self.parts,
         )
         server.register(metrics)
+        self.live = Live(ClientTold(self.bridge, self.views, adaptation), self.events)
+        add_page(server, self.live, metrics)
         return server
 
     def link_words(self) -> str:
@@ -597,6 +611,8 @@ class ClientDaemon:
                 stack.callback(self._ctx.destroy, linger=0)
             if self._http is not None:
                 stack.push_async_callback(self._http.stop)
+            if self.live is not None:
+                stack.callback(self.live.close)
             stack.callback(self.events.close)
             if self._endpoint_started:
                 stack.push_async_callback(self.site.endpoint.stop)

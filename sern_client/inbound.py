@@ -198,7 +198,7 @@ class Inbound:
         if incoming is not None:
             if self._goals is not None:
                 self._goals.ended(incoming.local)
-            if not self.commands.ended(stream.id):
+            if not self.commands.ended(stream.id, incoming.local):
                 self._close_publisher(incoming)
             _log.info("%s from %s has ended", stream.id.topic, stream.id.origin)
 
@@ -267,10 +267,9 @@ class Inbound:
     def message(self, stream: StreamInfo, message: Message, *, now: float) -> DropReason | None:
         """A message of one of our `streams` has its turn. Returns why it is not published; None: it was."""
         incoming = self._streams[stream.id]
-        if incoming.commands:
-            refused = self.commands.refuses(stream.id, born_s=message.born_s, now=now)
-            if refused is not None:
-                return refused
+        refused = self.commands.refuses(stream.id, incoming.local, born_s=message.born_s, now=now)
+        if refused is not None:
+            return refused
         if self.e_stops is not None:
             self.e_stops.heard(incoming.info, message.body, where=stream.id.origin)
         self._site.values.passed(stream, message.seq, message.body)

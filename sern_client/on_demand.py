@@ -17,6 +17,7 @@ from sern_client.site import CAPPED, Site
 from sern_core.objects.xr_object import XrObject
 from sern_core.site.services import parse as parse_service
 from sern_core.topics.patterns import PatternSet
+from sern_core.topics.spool_names import parse as parse_spooled
 from sern_core.vocabulary.errors import SernError
 from sern_core.vocabulary.ledger import OTHER_TOPIC, ReceiveLedger
 from sern_core.vocabulary.message import TopicInfo
@@ -72,6 +73,7 @@ class OnDemand:
             not name
             or "encoding" not in item.attributes
             or parse_service(name) is not None
+            or parse_spooled(name) is not None
             or not self._patterns.fullmatch(name)
         ):
             return

@@ -147,6 +147,8 @@ class Outbound:
         self.stop_sources()
         self._closed = True
         for outgoing in self._topics.values():
+            if self._taps is not None:
+                self._taps.close(outgoing.channel.stream.id)
             if outgoing.source is not None:
                 outgoing.source.close()
                 for channel in outgoing.source.own:
@@ -254,7 +256,6 @@ class Outbound:
         message of it is lost, unless more waits than its queue may hold, which is refused to its publisher. A topic
         that is kept on disk stays as it is until the next start."""
         self._site.rules, self._discovery = rules, discovery
-        self.unnamed.clear()
         for info in [] if self._stopped else list(self._known.values()):
             outgoing = self._topics.get(info.name)
             if outgoing is None:
@@ -271,6 +272,8 @@ class Outbound:
                 _log.warning("%s is kept on disk: what the new rules say of it holds from the next start on", info.name)
             else:
                 self._changing[info.name] = wanted
+        for name in [name for name in self.unnamed if name in self._topics]:
+            del self.unnamed[name]
         self._look_at_changing()
 
     def _look_at_changing(self) -> None:

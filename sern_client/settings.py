@@ -127,8 +127,7 @@ class Settings:
         restart = [key for key in different if key not in RELOADED]
         if (file.adaptation is None) != (self._started.adaptation is None):
             restart.append("adaptation")
-        if _e_stops(file) != _e_stops(self._started):
-            restart.append("e_stop")
+        restart += [key for key in ("e_stop", "holder") if _said(file, key) != _said(self._started, key)]
         self._have(kept, profile, file=file)
         return Reloaded(tuple(restart), tuple(ended))
 
@@ -208,9 +207,10 @@ def _section_of(file: ClientFile, name: TopicName) -> TopicSection | None:
     return next((section for section in file.topics if section.rule().match.fullmatch(name)), None)
 
 
-def _e_stops(file: ClientFile) -> dict[str, object]:
-    """What latches at this client: none comes or goes while it runs."""
-    return {section.match: section.e_stop for section in file.topics if section.e_stop is not None}
+def _said(file: ClientFile, key: str) -> dict[str, object]:
+    """What its rules say of a key that is read at the start alone, where messages come in."""
+    receives = [section for section in file.topics if section.direction.receives or key == "e_stop"]
+    return {section.match: getattr(section, key) for section in receives if getattr(section, key) is not None}
 
 
 def _says(section: TopicSection | None, key: str) -> object:

@@ -1,7 +1,7 @@
 """What a client tells over HTTP: the routes under /api that every client has."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Final
 
 from sern_client.bridge import Bridge
@@ -70,7 +70,8 @@ class ClientViews:
             "summaries": outbound.summaries.to_json(now),
             "refused": dict(list(outbound.refused.items())[:MAX_TOLD]),
             "subscriptions_refused": list(inbound.subscription_problems)[:MAX_TOLD],
-            "subscribed": list(self._core.subscription.patterns),
+            # Nobody misses a request that nobody makes.
+            "subscribed": [text for text in self._core.subscription.patterns if not self._bridge.asking.takes(text)],
             "by_hand": self._by_hand(),
             "stays_here": list(outbound.unnamed)[:MAX_TOLD],
             "now_s": now,
@@ -78,7 +79,10 @@ class ClientViews:
 
     def clients(self) -> dict[str, Any]:
         """The relay and the peers, in the shape of a relay's answer: what this client does not know is None."""
-        views = self._link_state.views()
+        return self.head() | {"clients": list(self.rows())}
+
+    def head(self) -> dict[str, Any]:
+        """The same without its rows."""
         return {
             "name": self._name,
             "role": "client",
@@ -87,8 +91,11 @@ class ClientViews:
             "refused": [],
             "refused_total": 0,
             "refused_gone": 0,
-            "clients": [self._relay(view) if view.own else _row(view) for view in views],
         }
+
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """The relay and the peers, each as it is when it is asked for."""
+        return (self._relay(view) if view.own else _row(view) for view in self._link_state.views())
 
     @property
     def _up(self) -> bool:

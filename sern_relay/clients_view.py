@@ -41,12 +41,15 @@ class ClientsSource:
     admission: Admission
     address: Callable[[ClientName], str]
 
+    def names(self) -> list[ClientName]:
+        """Everybody who is known."""
+        return sorted({*self.admission.names, *self.hub.links, *self.comings.clients})
+
 
 def clients_view(source: ClientsSource) -> JsonParts:
     """The answer. Times by the wall clock are for people; `_s` are how long ago."""
     head = {"name": source.relay, "role": "relay", "time": wall_text(time.time()), "now_s": clock.now()}
-    names = sorted({*source.admission.names, *source.hub.links, *source.comings.clients})
-    rows = (client_row(source, client) for client in names)
+    rows = (client_row(source, client) for client in source.names())
     return JsonParts(closing_array({**head, **source.refusals.to_json()}, "clients", rows), TOO_LARGE)
 
 

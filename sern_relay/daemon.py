@@ -56,6 +56,7 @@ from sern_runtime.open_files import require_open_files
 from sern_runtime.optional import OptionalParts
 from sern_runtime.reload_state import ReloadState
 from sern_runtime.sdnotify import Notifier, Watchdog
+from sern_runtime.watching.live import Live
 from sern_runtime.zap import ZapHandler, self_test
 
 if TYPE_CHECKING:
@@ -128,7 +129,15 @@ class RelayDaemon:
         )
         self.hub.after = self._after
         self.parts = OptionalParts(
-            "adaptation", "codecs", "feed", "http", "message_log", "metrics", "objects", "summary"
+            "adaptation",
+            "codecs",
+            "feed",
+            "http",
+            "message_log",
+            "metrics",
+            "objects",
+            "summary",
+            "watching",
         )
         self.message_log = MessageLog(loaded.resolve(model.message_log)) if model.message_log else None
         self.fates: LoggedFates | None = None
@@ -167,6 +176,7 @@ class RelayDaemon:
         )
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
         self._http: HttpServer | None = None
+        self.live: Live | None = None
         self.tasks: list[asyncio.Task[None]] = []
         self._ready = False
         self._flush_due: asyncio.Handle | None = None
@@ -253,6 +263,9 @@ class RelayDaemon:
         if self.adaptation is not None:
             kept = self.parts.keep("adaptation", self.adaptation.run, reset=self.adaptation.reset)
             self.tasks.append(asyncio.create_task(kept, name="adaptation"))
+        if self.live is not None:
+            kept = self.parts.keep("watching", self.live.run, reset=self.live.reset)
+            self.tasks.append(asyncio.create_task(kept, name="watching"))
         self._ready = True
         self.notifier.ready(f"{model.name} on {', '.join(relay.listen)}")
         self.events.say(
@@ -291,6 +304,9 @@ class RelayDaemon:
         if self.zap is not None:
             progress["zap"] = lambda: self.zap.counters.pings if self.zap else 0
             self.zap.ping()  # answered by the first sweep, which would else take it for stuck
+        if self.durable is not None:
+            disk = self.durable.disk
+            progress["store"] = lambda: disk.progress(now=clock.now())
         watchdog = Watchdog(self.notifier, progress)
         while True:
             await asyncio.sleep(SWEEP_S)
@@ -401,6 +417,7 @@ class RelayDaemon:
 
     def _make_http(self, listen: str) -> "HttpServer":
         from sern_runtime.http import HttpServer
+        from sern_runtime.watching.page import add_page
 
         registry = CollectorRegistry()
         metrics = Metrics(registry)
@@ -418,6 +435,8 @@ class RelayDaemon:
             parts=self.parts,
         )
         server.register(metrics)
+        self.live = Live(self.views.told(self.adaptation), self.events)
+        add_page(server, self.live, metrics)
         return server
 
     def _make_feed(self, ctx: "zmq.Context[zmq.Socket[bytes]]", roles: tuple[FeedRole, ...]) -> RelayFeed:
@@ -490,6 +509,8 @@ class RelayDaemon:
                     stack.callback(part.close)
             if self._http is not None:
                 stack.push_async_callback(self._http.stop)
+            if self.live is not None:
+                stack.callback(self.live.close)
             stack.callback(self.events.close)
             stack.callback(self.codecs.close)
             if self.durable is not None:

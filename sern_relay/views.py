@@ -11,6 +11,7 @@ from sern_relay.clients_view import ClientsSource, clients_view
 from sern_relay.comings import Comings
 from sern_relay.objects_view import objects_view
 from sern_relay.refusals import Refusals
+from sern_relay.told import RelayTold
 from sern_relay.trace_source import of_hub
 from sern_runtime import clock
 from sern_runtime.adaptation import Adaptation
@@ -38,6 +39,10 @@ class RelayViews:
         self._hub = hub
         self._events = events
         self._clients = ClientsSource(name, hub, comings, refusals, admission, address)
+
+    def told(self, adaptation: Adaptation | None) -> RelayTold:
+        """What the page is made of."""
+        return RelayTold(self._hub, self._clients, adaptation)
 
     def routes(self, adaptation: Adaptation | None) -> dict[str, JsonSource | JsonQuery]:
         return {

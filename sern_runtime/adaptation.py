@@ -3,7 +3,7 @@
 import asyncio
 import logging
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 from sern_core.adaptation.adapter import SAMPLES, HopAdapter
@@ -152,20 +152,24 @@ class Adaptation:
             if not (text.isascii() and text.isdecimal() and int(text[:9]) <= HISTORY):
                 raise UsageError(f"last is {text[:80]!r}; accepted: 0 to {HISTORY}")
             last = int(text)
-            links = (self._link_json(link, last) for link in tuple(self._adapters) if link in self._adapters)
-            return JsonParts(closing_array(self._about(), "links", links), TOO_LARGE)
+            return JsonParts(closing_array(self.about(), "links", self.rows(last)), TOO_LARGE)
 
         return JsonQuery(("last",), read)
 
+    def rows(self, last: int) -> Iterator[dict[str, Any]]:
+        """A row for each link, with its last intervals, the oldest first; each made when it is asked for."""
+        return (self._link_json(link, last) for link in tuple(self._adapters) if link in self._adapters)
+
     def to_json(self) -> dict[str, Any]:
         """What is in force, and the last intervals of each link, the oldest first, as /api/mmcf tells them."""
-        return self._about() | {"links": [self._link_json(link, HISTORY) for link in self._adapters]}
+        return self.about() | {"links": [self._link_json(link, HISTORY) for link in self._adapters]}
 
     def _link_json(self, link: Link, last: int) -> dict[str, Any]:
         history = list(self._history.get(link, ()))
         return {**adapter_json(self._adapters[link]), "history": history[max(0, len(history) - last) :]}
 
-    def _about(self) -> dict[str, Any]:
+    def about(self) -> dict[str, Any]:
+        """What holds for all links."""
         weights, ranges = self._params.weights, self._params.ranges
         return {
             "policy": self._section.policy,

@@ -138,6 +138,7 @@ class SpoolFetching:
         self._saved_s = 0.0
         self._changed = False
         self._saving: asyncio.Future[None] | None = None
+        self._started = False
         self._closed = False
 
     @property
@@ -145,12 +146,17 @@ class SpoolFetching:
         return self._keeper.store.directory
 
     def start(self) -> None:
-        """Read what earlier processes knew. Raises ConfigError."""
+        """Read what earlier processes knew. Where that cannot be, it is said, and this process fetches nothing."""
+        if self._keeper.problem is not None:
+            return  # which was said
         try:
             (self.directory / orders.FOLDER).mkdir(exist_ok=True)
             known = ledger.load(self.directory)
         except OSError as error:
-            raise ConfigError(f"cannot be used ({error.strerror})", file=str(self.directory)) from error
+            _log.error("%s: nothing is fetched by this process (%s); mend it and start it again", self.directory,
+                       error.strerror)  # fmt: skip
+            return
+        self._started = True
         for topic, boots in known.items():
             if len(self._remotes) < MAX_TOPICS:
                 remote = self._remotes[topic] = _Remote(topic, TopicFetch(secrets.randbits(62)))
@@ -305,6 +311,8 @@ class SpoolFetching:
 
     def look(self) -> None:
         """Ask for what is missing, and write down what is here. Call about twice a second."""
+        if not self._started:
+            return
         now = clock.now()
         if now - self._looked_s >= ORDERS_S:
             self._looked_s = now
@@ -333,7 +341,7 @@ class SpoolFetching:
         return [*asked, *([ALWAYS] if self._automatic else [])]
 
     def _ask(self, remote: _Remote) -> None:
-        if self._closed or remote.reports is None or self._keeper.problem is not None:
+        if self._closed or not self._started or remote.reports is None or self._keeper.problem is not None:
             return
         now = clock.now()
         windows = self._windows(remote)
@@ -446,7 +454,7 @@ class SpoolFetching:
 
     async def close(self) -> None:
         """Write down what is here. Idempotent; after the keeper is closed."""
-        if self._closed:
+        if self._closed or not self._started:
             return
         self._closed = True
         if self._saving is not None:

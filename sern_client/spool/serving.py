@@ -29,8 +29,8 @@ WINDOW_BYTES: Final = (256 * 2**10, 8 * 2**20)
 AHEAD_S: Final = 0.2
 """That is what the link carries in a round trip and so long, within these bounds."""
 PUMP_S: Final = 0.02
-MAX_ASKERS: Final = 64
-"""Topics of sites that fetch at one time, in all."""
+MAX_ASKERS: Final = 256
+"""Topics of sites that may be fetched, in all."""
 
 _log = logging.getLogger(__name__)
 
@@ -137,11 +137,13 @@ class SpoolServing:
         """A site may ask. ConfigError where it is nothing for us."""
         if parts.topic not in self._keeper.topics or parts.site != stream.id.origin:
             raise ConfigError(f"{stream.id.topic} from {stream.id.origin} asks for nothing that is kept here")
-        if len(self._askers) >= MAX_ASKERS:
-            raise ConfigError(f"{stream.id.topic}: {MAX_ASKERS} fetches are under way already")
         for identity, asker in list(self._askers.items()):
             if asker.parts == parts:  # the same site as a new process
                 self._dismiss(identity)
+        if len(self._askers) >= MAX_ASKERS:
+            why = f"{stream.id.origin} cannot fetch {parts.topic}: {MAX_ASKERS} topics are fetched by sites already"
+            self._refuse(why)
+            raise ConfigError(why)
         self._askers[stream.id] = _Asker(stream.id, parts)
 
     def stream_closed(self, stream: StreamInfo) -> None:

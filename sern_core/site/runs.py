@@ -54,6 +54,18 @@ class Runs:
         self.count += new
         return new
 
+    def remove(self, number: int) -> None:
+        """Leave out a number."""
+        firsts, lasts = self._firsts, self._lasts
+        index = bisect_right(firsts, number) - 1
+        if index < 0 or number > lasts[index]:
+            return
+        first, last = firsts[index], lasts[index]
+        left = [run for run in ((first, number - 1), (number + 1, last)) if run[0] <= run[1]]
+        firsts[index : index + 1] = [run[0] for run in left]
+        lasts[index : index + 1] = [run[1] for run in left]
+        self.count -= 1
+
     def remove_below(self, number: int) -> None:
         """Leave out every number below this one."""
         index = bisect_left(self._lasts, number)
@@ -65,9 +77,14 @@ class Runs:
 
     def within(self, first: int, last: int) -> int:
         """How many numbers from `first` to `last` are in it."""
-        low = bisect_left(self._lasts, first)
-        high = bisect_right(self._firsts, last)
-        return sum(min(self._lasts[i], last) - max(self._firsts[i], first) + 1 for i in range(low, high))
+        firsts, lasts = self._firsts, self._lasts
+        low, high = bisect_left(lasts, first), bisect_right(firsts, last)
+        if low >= high:
+            return 0
+        # What lies outside is little where this is asked for often.
+        outside: int = sum(lasts[i] - firsts[i] + 1 for i in (*range(low), *range(high, len(firsts))))
+        begun, ended = max(0, first - firsts[low]), max(0, lasts[high - 1] - last)
+        return self.count - outside - begun - ended
 
     def gaps(self, first: int, last: int) -> Iterator[Run]:
         """The runs of numbers from `first` to `last` that are not in it. It must not change meanwhile."""

@@ -258,22 +258,20 @@ class TopicFetch:
     def recorded(self, boot: int, seq: int) -> None:
         """A message that was accepted is safely recorded."""
         self.have(boot, seq, seq)
-        self._settle_came()
+        self._not_under_way(boot, seq)
 
     def lost(self, boot: int, seq: int) -> None:
         """A message that was accepted could not be recorded: it may be asked for again."""
-        came = self._came.get(boot)
-        if came is not None:
-            self._came[boot] = Runs(_without(came, seq))
+        self._not_under_way(boot, seq)
         for number, request in self._asked.items():
             if request.boot == boot and any(first <= seq <= last for first, last in request.runs):
                 self._torn.add(number)
 
-    def _settle_came(self) -> None:
-        """Forget what came, once all of it is recorded."""
-        for boot, came in list(self._came.items()):
-            had = self._had.get(boot)
-            if had is not None and all(had.within(first, last) == last - first + 1 for first, last in came):
+    def _not_under_way(self, boot: int, seq: int) -> None:
+        came = self._came.get(boot)
+        if came is not None:
+            came.remove(seq)
+            if not came:
                 del self._came[boot]
 
     def torn(self) -> None:
@@ -313,17 +311,6 @@ class TopicFetch:
     def forget_window(self, window: Window) -> None:
         """Nobody wants this window any more."""
         self._tried.pop(window, None)
-
-
-def _without(runs: Runs, number: int) -> Iterator[Run]:
-    for first, last in runs:
-        if not first <= number <= last:
-            yield first, last
-            continue
-        if first < number:
-            yield first, number - 1
-        if number < last:
-            yield number + 1, last
 
 
 def _gaps(first: int, last: int, sources: Sequence[Runs]) -> Iterator[Run]:

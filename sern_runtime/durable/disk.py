@@ -19,6 +19,7 @@ class Disk:
         self._store = store
         self._make_keeper = make_keeper
         self._problem: str | None = None
+        self._looks = 0
         self.keeper: Keeps | None = None
         """What writes; None: nothing is kept by this process."""
         self.damaged = 0
@@ -39,6 +40,13 @@ class Disk:
     def problem(self) -> str | None:
         """Why nothing is kept at the moment; None: it is."""
         return self._problem or (None if self.keeper is None else self.keeper.problem)
+
+    def progress(self, *, now: float) -> int:
+        """For the watchdog, as `Keeper.progress`; where nothing is kept there is nothing that could be stuck."""
+        if self.keeper is not None:
+            return self.keeper.progress(now=now)
+        self._looks += 1
+        return self._looks
 
     def open(self, stored: Stored) -> Contents | None:
         """Begin to write, and return what earlier processes have left. `stored` is told what is on disk.

@@ -12,6 +12,7 @@ from typing import Final, Protocol
 
 from sern_core.vocabulary.message import StreamId
 from sern_core.vocabulary.types import ClientName
+from sern_runtime import clock
 from sern_runtime.durable.store import (
     ROW_BYTES,
     Change,
@@ -28,6 +29,8 @@ from sern_runtime.durable.store import (
 IDLE_S: Final = 0.25
 RETRY_S: Final = 1.0
 """How often a disk that did not take a batch is asked again."""
+SLOW_S: Final = 10.0
+"""One attempt may take as long before the thread counts as stuck: cards and disks do stand still for seconds."""
 BATCH_BYTES: Final = 4 * 2**20
 """Bodies of one commit: it holds nothing up, but all of it is to be read again if it fails."""
 
@@ -60,6 +63,8 @@ class Keeps(Protocol):
     def forget(self, stream: StreamId) -> None: ...
 
     def change(self, change: Described | Place) -> None: ...
+
+    def progress(self, *, now: float) -> int: ...
 
     def close(self) -> None: ...
 
@@ -97,6 +102,9 @@ class Keeper:
         self._changes: deque[Change] = deque()
         self._urgent = 0  # of those, how many somebody waits for
         self._closing = False
+        self._busy = False  # something is to be written, or is being written
+        self._at_s = clock.now()  # when that began, or the last attempt
+        self._looks = 0
         self._condition = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="durable", daemon=True)
         self._sizes: dict[StreamId, deque[tuple[int, int]]] = {}  # of what is kept: seq, bytes
@@ -153,8 +161,17 @@ class Keeper:
         """Whatever else is to be written, in its turn."""
         self._add(change, urgent=False)
 
+    def progress(self, *, now: float) -> int:
+        """A number for the watchdog, another one at each look: but not when an attempt takes longer than `SLOW_S`, and
+        not when the thread has ended. A disk that refuses is no lack of progress: it is asked again."""
+        if self._thread.is_alive() and (not self._busy or now - self._at_s < SLOW_S):
+            self._looks += 1
+        return self._looks
+
     def _add(self, change: Change, *, urgent: bool) -> None:
         with self._condition:
+            if not self._busy:
+                self._busy, self._at_s = True, clock.now()
             self._changes.append(change)
             self._urgent += urgent
             self._condition.notify()
@@ -188,6 +205,7 @@ class Keeper:
     def _take(self) -> list[Change] | None:
         """The next batch, once there is one; None: there is none, and nothing more will come."""
         with self._condition:
+            self._busy = bool(self._changes)
             self._condition.wait_for(lambda: self._changes or self._closing)
             self._condition.wait_for(lambda: self._urgent or self._closing, timeout=IDLE_S)
             if not self._changes:
@@ -205,6 +223,7 @@ class Keeper:
     def _write(self, batch: list[Change]) -> bool:
         """Have a batch on disk, however long that takes. False: we are closing, and it does not take it."""
         while True:
+            self._at_s = clock.now()
             try:
                 self._store.apply(batch)
             except StoreError as error:

@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 
 from sern_core.site.runs import Run
 from sern_core.site.spool import Span
+from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.types import TopicName
 from sern_runtime import clock
 from sern_runtime.spool.files import Kept, KeptStream
@@ -87,7 +88,11 @@ class SpoolKeeper:
         `problem`: what is there is not known then, and nothing is kept by this process."""
         try:
             self.store.open()
+        except ConfigError:
+            self.store.close()
+            raise
         except OSError as error:
+            self.store.close()
             self.problem = f"{self.store.directory}: {error.strerror}"
             _log.error("nothing is kept in the spool by this process: %s; make room and start it again", self.problem)
             return

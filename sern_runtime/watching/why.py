@@ -48,6 +48,7 @@ SET_SHOWN: Final = 5
 """Refusals of the access rules that a relay is asked about."""
 MUCH: Final = 0.1
 """A share of what is offered whose loss is worth a word."""
+NO_LINK: Final = "there is no link to the relay"
 AWAY: Final = frozenset({"away", "forgotten", "never", "silent"})
 LITERAL: Final = re.compile(r"(?:/[A-Za-z0-9_~]+)+")
 NAMESPACED: Final = re.compile(r"(.*)\(\?:([^()|]*)\)")
@@ -167,7 +168,7 @@ class _Situation:
         if flow.answered and not flow.wanted:
             return NOTE, "nobody subscribes to it"
         if self._down:
-            return BAD, "there is no link to the relay"
+            return BAD, NO_LINK
         if not flow.answered:
             return WARN, "waits for the relay to say whether anybody wants it"
         found = self._dropped(flow, changed)
@@ -209,7 +210,7 @@ class _Situation:
 
     def _arrives(self, flow: Flow, changed: Change) -> Word:
         if self._down:
-            return BAD, "there is no link to the relay"
+            return BAD, NO_LINK
         gone = self._gone(flow.owners)
         if gone:
             return BAD, gone
@@ -228,7 +229,7 @@ class _Situation:
             return OK, ""
         who = _names(flow.owners) or "its publisher"
         verb = "are" if len(flow.owners) > 1 else "is"
-        return WARN, f"nothing for {_span(flow.age_s)}, though {who} {verb} connected: look at `sern top` there"
+        return WARN, f"nothing for {span(flow.age_s)}, though {who} {verb} connected: look at `sern top` there"
 
     def _at_relay(self, flow: Flow, changed: Change) -> Word:
         gone = self._gone(flow.owners)
@@ -252,7 +253,7 @@ class _Situation:
         if not owners or len(away) < len(owners):
             return ""
         first = away[0]
-        how_long = "" if first.since_s is None else f" for {_span(first.since_s)}"
+        how_long = "" if first.since_s is None else f" for {span(first.since_s)}"
         return f"{first.peer} " + ("does not answer" if first.state == "silent" else f"is gone{how_long}")
 
     # --- topics that there are not ----------------------------------------------------------------------------------
@@ -268,7 +269,7 @@ class _Situation:
             if denied is not None:
                 yield name, (BAD, f"access denied: {denied}")
             elif self._down:
-                yield name, (BAD, "there is no link to the relay")
+                yield name, (BAD, NO_LINK)
             elif gone := self._gone((owner,)):
                 yield name, (BAD, gone)
             elif owner == self._sample.name:
@@ -320,7 +321,8 @@ def _names(owners: tuple[str, ...]) -> str:
     return ", ".join(owners[:2]) + (f" and {len(owners) - 2} more" if len(owners) > 2 else "")
 
 
-def _span(seconds: float) -> str:
+def span(seconds: float) -> str:
+    """A time span for a sentence."""
     if seconds < 100:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.0f} h"

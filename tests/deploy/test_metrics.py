@@ -45,6 +45,13 @@ def alerts() -> list[dict[str, Any]]:
     return [rule for group in RULES["groups"] for rule in group["rules"]]
 
 
+def expressions_of(name: str) -> list[str]:
+    """Every expression of a dashboard, with its variables filled in."""
+    dashboard: dict[str, Any] = json.loads((DEPLOY / "grafana" / name).read_text())
+    targets = [target for panel in dashboard["panels"] for target in panel.get("targets", ())]
+    return [re.sub(r"\$\w+", ".*", target["expr"]) for target in targets]
+
+
 def expressions() -> list[str]:
     """Every expression of dashboard and rules, with the dashboard's variables filled in."""
     found = [target["expr"] for panel in panels() for target in panel["targets"]]

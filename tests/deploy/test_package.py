@@ -37,7 +37,9 @@ def test_every_file_of_a_package_is_packaged() -> None:
     # Whoever imports meanwhile writes compiled files, under other names until they are whole.
     others = [path for path in files if path.suffix != ".py" and "__pycache__" not in path.parts]
     assert [path for path in others if not any(fnmatch(str(path), f"*/{pattern}") for pattern in data)] == []
-    assert {path.name for path in others} == {"py.typed", "profiles.yaml", "segmentation.onnx"}
+    assert {path.name for path in others} == {
+        "py.typed", "profiles.yaml", "segmentation.onnx", "index.html", "page.css", "page.js",
+    }  # fmt: skip
 
 
 def test_what_is_built_finds_its_profiles_without_the_checkout(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from tests.exploring import cases
 
 NUMBERS = st.integers(1, 60)
 RUNS = st.tuples(NUMBERS, st.integers(0, 12)).map(lambda pair: (pair[0], pair[0] + pair[1]))
-STEPS = st.lists(st.tuples(st.sampled_from(["add", "below", "shed"]), RUNS), max_size=30)
+STEPS = st.lists(st.tuples(st.sampled_from(["add", "below", "shed", "remove"]), RUNS), max_size=30)
 
 
 def numbers(runs: Runs) -> set[int]:
@@ -26,6 +26,9 @@ def test_runs_are_the_set_of_their_numbers(steps: list[tuple[str, tuple[int, int
             new = runs.add(first, last)
             assert new == len(set(range(first, last + 1)) - model)
             model |= set(range(first, last + 1))
+        elif step == "remove":
+            runs.remove(first)
+            model.discard(first)
         elif step == "below":
             runs.remove_below(first)
             model = {number for number in model if number >= first}

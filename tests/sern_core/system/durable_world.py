@@ -94,6 +94,9 @@ class SimKeeper:
     def forget(self, stream: StreamId) -> None:
         self.change(Forget(stream))
 
+    def progress(self, *, now: float) -> int:
+        return int(now * 1e3)
+
     def change(self, change: Change) -> None:
         self._changes.append(change)
         if not self._busy:

@@ -1,6 +1,7 @@
 """The keeper: group commit, acknowledged only what is on disk, a disk that fails and comes back."""
 
 import asyncio
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -8,9 +9,10 @@ import pytest
 
 from sern_core.vocabulary.message import StreamId
 from sern_core.vocabulary.types import ClientName, TopicName
-from sern_runtime.durable.keeper import Keeper
+from sern_runtime import clock
+from sern_runtime.durable.keeper import SLOW_S, Keeper
 from sern_runtime.durable.store import ROW_BYTES, Change, Described, Put, Row, Store, StoreError
-from tests.support import until
+from tests.support import DEADLINE_S, until
 
 STREAM = StreamId(ClientName("robot1"), 7, TopicName("/robot1/log"))
 OTHER = StreamId(ClientName("robot2"), 7, TopicName("/robot2/log"))
@@ -29,6 +31,26 @@ class Gate(Store):
             raise StoreError("the disk is full")
         super().apply(changes)
         self.batches.append(sum(isinstance(change, Put) for change in changes))
+
+
+class Stopped(Gate):
+    """A store whose first write stands still until `go`."""
+
+    def __init__(self, directory: Path) -> None:
+        super().__init__(directory)
+        self.begun, self.go = threading.Event(), threading.Event()
+
+    def apply(self, changes: Sequence[Change]) -> None:
+        self.begun.set()
+        assert self.go.wait(DEADLINE_S)
+        super().apply(changes)
+
+
+class Broken(Store):
+    """A store with an error in it."""
+
+    def apply(self, changes: Sequence[Change]) -> None:
+        raise ZeroDivisionError
 
 
 def make(store: Store, got: list[int], *, max_bytes: int = 2**20, shared: bool = False) -> Keeper:
@@ -151,4 +173,43 @@ async def test_an_origin_leaves_as_much_free_as_it_has(tmp_path: Path) -> None:
     assert not keeper.has_room(STREAM.origin, size)
     keeper.forget(STREAM)
     assert keeper.has_room(OTHER.origin, size)
+    keeper.close()
+
+
+def moves(keeper: Keeper, *, now: float) -> bool:
+    """What a watchdog takes for progress: two looks, one after the other, that differ."""
+    return keeper.progress(now=now) != keeper.progress(now=now)
+
+
+async def test_a_write_that_does_not_end_is_seen_by_the_watchdog_and_a_disk_that_refuses_is_not(tmp_path: Path) -> None:
+    got: list[int] = []
+    store = Stopped(tmp_path)
+    keeper = make(store, got)
+    assert not moves(keeper, now=clock.now()), "it has no thread yet"
+    keeper.start()
+    await until(store.begun.is_set, "the first batch is on its way to the disk")
+    assert moves(keeper, now=clock.now()), "slow is not stuck"
+    assert not moves(keeper, now=clock.now() + SLOW_S)
+    store.go.set()
+    await until(lambda: moves(keeper, now=clock.now() + SLOW_S), "it has nothing to do, for however long")
+    store.full = True
+    keeper.put(put(1))
+    await until(lambda: keeper.failures > 1, "it was tried again")
+    assert moves(keeper, now=clock.now())
+    store.full = False
+    await until(lambda: got == [1], "kept")
+    keeper.close()
+    assert not moves(keeper, now=clock.now()), "its thread has ended"
+
+
+async def test_a_thread_that_ended_by_an_error_is_seen_by_the_watchdog(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended: list[object] = []
+    monkeypatch.setattr(threading, "excepthook", ended.append)
+    store = Broken(tmp_path)
+    keeper = make(store, [])
+    keeper.start()
+    await until(lambda: ended, "the thread has ended")
+    await until(lambda: not moves(keeper, now=clock.now()), "which is no progress")
     keeper.close()
