@@ -103,11 +103,14 @@ class SpoolKeeper:
     def put(self, kept: Kept) -> bool:
         """Keep a message. False: there is no room in the buffer, or the store is not open; it is counted."""
         cost_bytes = len(kept.body) + OVERHEAD_BYTES
-        full = self._taken_bytes - self._done_bytes + cost_bytes > BUFFER_BYTES
+        waiting_bytes = self._taken_bytes - self._done_bytes
+        full = waiting_bytes + cost_bytes > BUFFER_BYTES
         if full and not self._overflowing:
+            self._overflowing = True
             _log.error("%s: the disk is slower than the messages; they are not kept until it catches up",
                        self.store.directory)  # fmt: skip
-        self._overflowing = full
+        elif waiting_bytes < BUFFER_BYTES // 2:
+            self._overflowing = False  # else a disk that is just too slow would be said with every other message
         if full or not self._open:
             self.overflowed += full
             self.failed += not full

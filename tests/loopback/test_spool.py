@@ -23,12 +23,13 @@ PLAY = {"rate": 1}
 
 
 def heavy_bag(path: Path) -> Path:
-    """Texts that nothing makes smaller, so that it takes a while to fetch them."""
+    """Texts that nothing makes smaller, so that it takes a while to fetch them; together less than the buffer of what
+    keeps them, however slow the disk is."""
     file, random = BagFile(path), Random(1)
     info = topic_info("/chat", "std_msgs/msg/String", Encoding.ROS1)
     file.add(info)
     for number in range(COUNT):
-        text = random.randbytes(20_000)
+        text = random.randbytes(4_000)
         file.write(info, 10**18 + number * 10**6, len(text).to_bytes(4, "little") + text)
     file.finish()
     return path
