@@ -10,7 +10,7 @@ PACKAGES := sern_core sern_runtime sern_relay sern_client sern_sim sern_twin ser
 # quarter less of CPU, and each worker of the tests would rewrite all of them anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup lint format types test wheel compiled test-compiled deb test-install arm-wheels explore standstills soak fuzz kills lab bench performance endpoints operations figures cellular navigation picture demo demo-twin demo-navigation schemas clean
+.PHONY: help setup lint format types test wheel compiled test-compiled deb image test-install arm-wheels explore standstills soak fuzz kills lab bench performance endpoints operations figures cellular navigation picture demo demo-twin demo-navigation schemas clean
 
 help:
 	@echo "make setup    create $(VENV) with pinned dependencies"
@@ -21,6 +21,7 @@ help:
 	@echo "make wheel    a wheel in dist/ whose core is compiled;  make test-compiled: the tests of the core and of the daemons on it"
 	@echo "make compiled an environment with that wheel, .venv-compiled, also for benchmarks"
 	@echo "make deb      Debian packages in dist/ with that wheel;  make test-install   as root: they install, run under systemd, and go"
+	@echo "make image    as root: a container image of the package, localhost/sern"
 	@echo "make arm-wheels  which pinned dependencies have wheels for ARM computers, for docs/install.md"
 	@echo "make explore  the tests with random input, with new cases and ten times as many; SEED=... repeats a run"
 	@echo "make standstills   the tests whose processes stand still for moments, as on a loaded machine; SEED=..."
@@ -86,6 +87,10 @@ test-compiled: compiled
 # The Debian packages, for the Python of Debian itself: it has to be of the version of PYTHON, whose compiler made the wheel.
 deb: wheel
 	deploy/debian/build dist/sern-*.whl
+
+# As root: a container image of that package, localhost/sern, by buildah.
+image: deb
+	deploy/image/build dist/sern_*.deb
 
 # Some minutes, and five more at the first time, for a Debian to install them in (.rootfs).
 test-install: deb

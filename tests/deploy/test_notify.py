@@ -109,3 +109,15 @@ async def test_a_client_whose_relay_has_no_address(tmp_path: Path, systemd: Syst
         await until(lambda: systemd.status("link down") and systemd.last_status.startswith(down), "says why")
         assert client.get("/readyz")[1].startswith(down.removeprefix("STATUS=link down: "))
         await ends(client, systemd)
+
+
+async def test_idle_stores_of_durable_topics_do_not_look_stuck(tmp_path: Path, systemd: Systemd) -> None:
+    async with Lab(tmp_path, "site") as lab:
+        relay = lab.process(lab.relay_file(durable={"directory": "held"}))
+        await until(lambda: systemd.count("WATCHDOG=1") >= 3, "pings of the relay")
+        await ends(relay, systemd)
+        systemd.told.clear()
+        client = lab.process(lab.recorder_file("site", "/.*", durable={"directory": "kept"}))
+        await until(lambda: systemd.count("WATCHDOG=1") >= 3, "pings of the client")
+        assert "no progress" not in relay.log.read_text() + client.log.read_text()
+        await ends(client, systemd)
