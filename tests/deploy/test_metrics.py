@@ -29,7 +29,13 @@ from tests.sern_client.navigation.graph import Graph
 
 DEPLOY: Final = Path(__file__).resolve().parents[2] / "deploy"
 OPERATIONS: Final = DEPLOY.parent / "docs" / "operations.md"
-DASHBOARD: Final[dict[str, Any]] = json.loads((DEPLOY / "grafana" / "sern.json").read_text())
+DASHBOARDS: Final[dict[str, dict[str, Any]]] = {
+    path.name: json.loads(path.read_text()) for path in sorted((DEPLOY / "grafana").glob("*.json"))
+}
+VARIABLES: Final = {
+    "sern.json": ["datasource", "instance", "peer", "topic"],
+    "sern-fleet.json": ["datasource", "instance"],
+}
 RULES: Final[dict[str, Any]] = YAML(typ="safe").load((DEPLOY / "prometheus" / "sern.rules.yml").read_text())
 OF_PROMETHEUS: Final = {"up"}
 TARGET_LABELS: Final = {"instance", "job"}
@@ -37,8 +43,8 @@ _SELECTOR: Final = re.compile(r"\b((?:sern|process)_\w+|up)\b(?:\{([^}]*)\})?")
 _GROUPING: Final = re.compile(r"\b(?:by|without)\s*\(([^)]*)\)")
 
 
-def panels() -> list[dict[str, Any]]:
-    return [panel for panel in DASHBOARD["panels"] if panel["type"] != "row"]
+def panels(name: str) -> list[dict[str, Any]]:
+    return [panel for panel in DASHBOARDS[name]["panels"] if panel["type"] != "row"]
 
 
 def alerts() -> list[dict[str, Any]]:
@@ -47,16 +53,12 @@ def alerts() -> list[dict[str, Any]]:
 
 def expressions_of(name: str) -> list[str]:
     """Every expression of a dashboard, with its variables filled in."""
-    dashboard: dict[str, Any] = json.loads((DEPLOY / "grafana" / name).read_text())
-    targets = [target for panel in dashboard["panels"] for target in panel.get("targets", ())]
-    return [re.sub(r"\$\w+", ".*", target["expr"]) for target in targets]
+    return [re.sub(r"\$\w+", ".*", target["expr"]) for panel in panels(name) for target in panel["targets"]]
 
 
 def expressions() -> list[str]:
-    """Every expression of dashboard and rules, with the dashboard's variables filled in."""
-    found = [target["expr"] for panel in panels() for target in panel["targets"]]
-    found += [rule["expr"] for rule in alerts()]
-    return [re.sub(r"\$\w+", ".*", text) for text in found]
+    """Every expression of dashboards and rules."""
+    return [text for name in DASHBOARDS for text in expressions_of(name)] + [rule["expr"] for rule in alerts()]
 
 
 def navigation() -> str:
@@ -198,13 +200,14 @@ def test_expressions_parse(tmp_path: Path) -> None:
         assert result.returncode == 0, result.stdout + result.stderr
 
 
-def test_the_dashboard_is_whole() -> None:
-    ids = [panel["id"] for panel in DASHBOARD["panels"]]
-    assert len(ids) == len(set(ids)) > 30
-    titles = [panel["title"] for panel in panels()]
+@pytest.mark.parametrize("name", VARIABLES)
+def test_a_dashboard_is_whole(name: str) -> None:
+    ids = [panel["id"] for panel in DASHBOARDS[name]["panels"]]
+    assert len(ids) == len(set(ids)) > 9
+    titles = [panel["title"] for panel in panels(name)]
     assert len(titles) == len(set(titles))
-    assert [item["name"] for item in DASHBOARD["templating"]["list"]] == ["datasource", "instance", "peer", "topic"]
-    for panel in panels():
+    assert [item["name"] for item in DASHBOARDS[name]["templating"]["list"]] == VARIABLES[name]
+    for panel in panels(name):
         defaults = panel["fieldConfig"]["defaults"]
         assert defaults["unit"], panel["title"]
         values = [step["value"] for step in defaults["thresholds"]["steps"]]
@@ -216,9 +219,16 @@ def test_the_dashboard_is_whole() -> None:
         assert panel["datasource"] == {"type": "prometheus", "uid": "${datasource}"}
 
 
-def test_panels_do_not_overlap() -> None:
+def test_dashboards_are_known_and_told_apart() -> None:
+    assert DASHBOARDS.keys() == VARIABLES.keys()
+    for key in ("uid", "title"):
+        assert len({dashboard[key] for dashboard in DASHBOARDS.values()}) == len(DASHBOARDS)
+
+
+@pytest.mark.parametrize("name", VARIABLES)
+def test_panels_do_not_overlap(name: str) -> None:
     taken: dict[tuple[int, int], str] = {}
-    for panel in DASHBOARD["panels"]:
+    for panel in DASHBOARDS[name]["panels"]:
         place = panel["gridPos"]
         assert place["x"] + place["w"] <= 24
         for x in range(place["x"], place["x"] + place["w"]):

@@ -1,7 +1,7 @@
 """Dashboards and alerts in a real Prometheus over real daemons: what is asked is answered, alerts fire and clear.
 
-Of the alerts those are here whose cause can be made and undone within seconds: a robot, its link and its operator that are
-gone, a reload that fails, strangers. The others' expressions are parsed and their metrics looked for in test_metrics.
+Of the alerts those are here whose cause can be made and undone within seconds: a robot, its link and its operator are
+gone, a reload fails, strangers come. The others' expressions are parsed and their metrics looked for in test_metrics.
 """
 
 import signal
@@ -17,7 +17,7 @@ from sern_sim.models import LinkModel
 from sern_tools.proxy import Route, ShapingProxy
 from tests.daemons import HOST, Json, Lab, Process
 from tests.deploy.prometheus import Prometheus, missing, prometheus, scaled
-from tests.deploy.test_metrics import RULES, expressions_of
+from tests.deploy.test_metrics import DASHBOARDS, RULES, expressions_of
 from tests.support import until
 
 pytestmark = pytest.mark.skipif(missing() is not None, reason=missing() or "")
@@ -91,7 +91,7 @@ async def test_every_panel_has_data_and_alerts_fire_and_clear(tmp_path: Path) ->
 
 
 async def every_panel_has_data(server: Prometheus) -> None:
-    for expression in expressions_of("sern.json"):
+    for expression in (text for name in DASHBOARDS for text in expressions_of(name)):
         await until(partial(server.asked, expression), f"{expression} has data")
 
 
