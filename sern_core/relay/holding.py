@@ -123,6 +123,29 @@ class Holding:
         channels: Iterable[OutChannel] = () if link is None else link.sender.channels.values()
         return any(channel.spec.durable and channel.retained for channel in channels)
 
+    def went(self, client: ClientName) -> None:
+        """A client has gone: have it on disk how far it is, so that it gets nothing twice if this relay ends, too."""
+        if self.shelf is None:
+            return
+        for identity, held in self._held.items():
+            channel = self._channels(identity).get(client)
+            if channel is not None:
+                self._place(self.shelf, identity, held, client, channel)
+
+    def _channels(self, identity: StreamId) -> dict[ClientName, OutChannel]:
+        """Those of the clients that are to get a stream."""
+        channels = self._streams.draining.channels(identity)
+        relayed = self._streams.by_id.get(identity)
+        if relayed is not None:
+            channels |= {client: channel for client, (_link, channel) in relayed.outs.items()}
+        return channels
+
+    @staticmethod
+    def _place(shelf: Shelf, identity: StreamId, held: _Held, client: ClientName, channel: OutChannel) -> None:
+        if held.places.get(client) != channel.watermark:
+            held.places[client] = channel.watermark
+            shelf.place(identity, client, channel.watermark)
+
     def look(self, *, now: float) -> None:
         """Let go of what everybody has. Call about once a second."""
         shelf = self.shelf
@@ -130,13 +153,9 @@ class Holding:
             return
         for identity, held in list(self._held.items()):
             relayed = self._streams.by_id.get(identity)
-            channels = self._streams.draining.channels(identity)
-            if relayed is not None:
-                channels |= {client: channel for client, (_link, channel) in relayed.outs.items()}
+            channels = self._channels(identity)
             for client, channel in channels.items():
-                if held.places.get(client) != channel.watermark:
-                    held.places[client] = channel.watermark
-                    shelf.place(identity, client, channel.watermark)
+                self._place(shelf, identity, held, client, channel)
             for client in held.places.keys() - channels.keys():
                 del held.places[client]
             upto = min(held.places.values(), default=held.put)

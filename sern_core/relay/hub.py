@@ -317,6 +317,7 @@ class Hub:
     def on_down(self, link: Link, reason: str, *, now: float) -> None:
         self.clients.went(link.peer, now)
         self.presence.changed(link.peer, now=now)
+        self.holding.went(link.peer)
         self.events.client_down(link.peer, reason)
 
     def on_lane_closed(self, link: Link) -> None:

@@ -147,3 +147,17 @@ def test_a_name_is_offered_once() -> None:
     robot = Play(8).robot
     with pytest.raises(UsageError, match=r"/robot/log is offered already"):
         robot.topics.publish(robot.info, SPEC)
+
+
+def test_who_goes_shortly_before_the_relay_dies_gets_nothing_twice() -> None:
+    """A site ends, and a moment later the relay: the next relay knows how far the site was."""
+    play = Play(9)
+    play.world.run(1.6)
+    before = [int(got.body) for got in play.site.on(TOPIC)]
+    play.site.core.link.close("it ends", now=play.site.now)
+    play.world.run(0.2)
+    before = [int(got.body) for got in play.site.on(TOPIC)]
+    play.kill_relay()
+    play.site = play.world.restart_client("site")
+    got = [*before, *play.finish()]
+    assert got == sorted(set(got)) and len(got) > len(before) > 10

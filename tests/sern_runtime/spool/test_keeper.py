@@ -63,10 +63,11 @@ async def test_a_slow_disk_holds_up_nobody_and_what_there_is_no_room_for_is_coun
     keeper, disk = started(tmp_path)
     disk.gate.clear()
     taken = sum(keeper.put(message(seq, 744)) for seq in range(1, 101))
-    assert taken == 10 and keeper.overflowed == 90
+    assert taken in (10, 11), "one may be in the hands of the thread"
+    assert keeper.overflowed == 100 - taken
     assert caplog.text.count("the disk is slower than the messages") == 1
     disk.gate.set()
-    await until(lambda: keeper.written == 10, "what was taken is safe")
+    await until(lambda: keeper.written == taken, "what was taken is safe")
     keeper.close()
 
 
