@@ -340,11 +340,14 @@ class Inbound:
         last_s = self._last_arrival_s.get(stream.id)
         self._last_arrival_s[stream.id] = now
         deadline_s = stream.spec.deadline_s
-        if last_s is not None and deadline_s is not None and now - last_s > deadline_s:
-            topic = stream.id.topic
-            known = topic in self.deadlines_missed or len(self.deadlines_missed) < MAX_TOPICS
-            counted = topic if known else OTHER_TOPIC
-            self.deadlines_missed[counted] = self.deadlines_missed.get(counted, 0) + 1
+        if deadline_s is None:
+            return
+        topic = stream.id.topic
+        known = topic in self.deadlines_missed or len(self.deadlines_missed) < MAX_TOPICS
+        missed = last_s is not None and now - last_s > deadline_s
+        counted = topic if known else OTHER_TOPIC
+        self.deadlines_missed[counted] = self.deadlines_missed.get(counted, 0) + missed  # 0 at first, for the metric
+        if last_s is not None and missed:
             _log.warning("%s: %.3f s between messages, deadline %.3f s", topic, now - last_s, deadline_s)
 
     # --- what is confirmed later ------------------------------------------------------------------------------------
