@@ -1,7 +1,7 @@
 """Emergency stops: a message latches one, and no command of other sites is obeyed until it is released by name.
 
-What is latched is on disk before anybody is told of it, so that a restart of the client changes nothing; a file that
-cannot be read counts as every stop latched. A release is a call of `release`, never a message of the topic itself: a
+The robot is stopped at once. What is latched is on disk before anybody is told of it, so that a restart of the client
+changes nothing; a file that cannot be read counts as every stop latched. A release is a call of `release`, never a message of the topic itself: a
 topic that says "not stopped" twice a second would end each stop at once.
 """
 
@@ -83,12 +83,13 @@ class EStops:
         stop = self._stops.get(info.name)
         if stop is None or not says_stop(info, body):
             return
-        if info.name not in self._latched:
-            self._latched[info.name] = wall_text(time.time())
+        known = info.name in self._latched
+        self._latched.setdefault(info.name, wall_text(time.time()))
+        self._halt(stop.stops)  # before the disk, which may take seconds
+        if not known:
             self._write()
             words = "%s: stopped by %s; commands are refused until `sern release %s`"
             self._events.say(_log, logging.WARNING, "e_stop", info.name, words, info.name, where, info.name)
-        self._halt(stop.stops)
 
     def release(self, topic: TopicName, *, who: str) -> None:
         """Obey commands again. Raises UsageError for a topic that is none or is not latched."""

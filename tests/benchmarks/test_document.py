@@ -184,7 +184,7 @@ def test_a_person_in_a_hurry_can_read_the_readme() -> None:
     """Words for every figure and system that it shows, and one number a cell."""
     assert {name for cases in IN_README.values() for names in cases.values() for name in names} == set(README_TITLES)
     text = README.read_text(encoding="utf-8")
-    assert text.count("![") == 2
+    assert text.count("![") == 3
     for name in ("link", "endpoints"):
         table = text.partition(f"<!-- {name} begin -->")[2].partition(f"<!-- {name} end -->")[0]
         rows = [line.strip("| ").split(" | ") for line in table.splitlines() if line.startswith("| ")]

@@ -83,7 +83,7 @@ def test_the_steps_of_the_verb_are_those_that_are_looked_at() -> None:
 def test_every_table_of_a_benchmark_has_a_verb_that_writes_it() -> None:
     """Last comes the document, which gets what each step has written. The matrix is a test's, for `make lab`."""
     written = set()
-    for verb in ("performance", "endpoints", "figures", "cellular", "navigation"):
+    for verb in ("performance", "endpoints", "operations", "figures", "cellular", "navigation", "soak"):
         *measured, document = steps(verb)
         files = [words[words.index("--json") + 1] for words in measured if words[0] != "benchmarks.ready"]
         assert document == ["benchmarks.document", *files]
