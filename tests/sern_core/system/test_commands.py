@@ -193,3 +193,28 @@ def test_the_hold_of_an_operator_whose_link_is_gone_lapses_and_whoever_was_refus
     holders.append(hold.holder)
     assert holders == [None, "bert"] and obeyed[-1][1] == "bert"
     world.validate()
+
+
+def test_what_is_refused_while_an_e_stop_is_latched_is_counted_and_delivered_to_nobody() -> None:
+    """Latched from 2 s to 4 s, as a site's bridge says of each message."""
+    world, topic = World().watch(), TopicName(TOPIC)
+    anna, robot = world.client("anna"), world.client("robot", patterns=[TOPIC])
+    obeyed, began_s = list[float](), world.now
+
+    def command(_stream: StreamInfo, _message: Message, *, now: float) -> DropReason | None:
+        at_s = world.now - began_s
+        if 2.0 <= at_s < 4.0:
+            return DropReason.E_STOP
+        obeyed.append(at_s)
+        return None
+
+    robot.message = command  # type: ignore[method-assign, assignment]
+    kind = spec(PriorityClass.CONTROL, lifespan_s=LIFESPAN_S)
+    channel = anna.core.publish(TopicInfo(topic, "a/b", Encoding.CDR), kind, now=anna.now)
+    anna.every(PERIOD_S, channel, b"go", first_s=1.0)
+    world.run(6.0)
+    counted = robot.core.received.topics[topic]
+    assert counted.by_reason[DropReason.E_STOP] == pytest.approx(2.0 / PERIOD_S, abs=2)
+    assert counted.delivered == len(obeyed) and not [at_s for at_s in obeyed if 2.0 <= at_s < 4.0]
+    assert obeyed[0] < 2.0 and obeyed[-1] > 4.0
+    world.validate()

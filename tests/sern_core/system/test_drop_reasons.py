@@ -33,6 +33,8 @@ PROOFS: Final = {
         "system/test_faults.py::test_a_reliable_message_that_a_site_fails_at_is_reported_and_the_stream_goes_on"
     ),
     DropReason.STORAGE: "site/test_holding.py::test_what_was_lost_is_reported_to_its_origin_before_it_is_confirmed",
+    DropReason.E_STOP: "system/test_commands.py",
+    DropReason.NOT_HOLDER: "system/test_commands.py",
     DropReason.TOO_SLOW: "link/test_outlook.py::test_what_cannot_arrive_is_hardly_ever_begun",
 }
 """Where each is made to happen and asserted."""
