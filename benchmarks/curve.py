@@ -35,7 +35,7 @@ def bench(options: argparse.Namespace, report: common.Report) -> None:
                 secured,
                 messages_hz=statistics.median(sample.messages_hz for sample in samples[secured]),
                 messages_without_hz=statistics.median(sample.messages_hz for sample in samples[plain]),
-                share=share,
+                kept_share=share,
                 relay_cpu_times=_ratio(samples, secured, plain, "relay_cpu_us"),
             )
             if (secured, case) in LIMITS:
