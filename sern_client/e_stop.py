@@ -1,8 +1,8 @@
 """Emergency stops: a message latches one, and no command of other sites is obeyed until it is released by name.
 
 The robot is stopped at once. What is latched is on disk before anybody is told of it, so that a restart of the client
-changes nothing; a file that cannot be read counts as every stop latched. A release is a call of `release`, never a message of the topic itself: a
-topic that says "not stopped" twice a second would end each stop at once.
+changes nothing; a file that cannot be read counts as every stop latched. A release is a call of `release`, never a
+message of the topic itself: a topic that says "not stopped" twice a second would end each stop at once.
 """
 
 import json
