@@ -18,6 +18,8 @@ from sern_core.wire.announce import Announcement
 
 WHY_CHARS: Final = 400
 """The most of a reason that a refusal carries."""
+MAX_REMEMBERED: Final = 1024
+"""Durable streams that have ended whose place is remembered."""
 
 
 class StreamsIn:
@@ -58,6 +60,8 @@ class StreamsIn:
         self.watermarks: dict[int, int] = {}
         """Up to where a channel is delivered, where the peer is still to be told."""
         self._gone: deque[InStream] = deque()  # streams that the peer no longer has, to be retracted
+        self._had: dict[StreamId, tuple[int, int]] = {}
+        """Of durable streams that the peer has no longer, the latest: what was delivered here, and confirmed."""
         self._skipping: dict[InStream, None] = {}  # streams that leave messages out, and go on in a while
         self._missing: dict[StreamId, float] = {}  # not announced by a new peer, and since when
         self._fresh: deque[tuple[InStream, Message, int]] = deque()
@@ -120,7 +124,9 @@ class StreamsIn:
             stream = InStream(
                 announcement.stream, self._reassembly, self._deliver, self._in_drop, first=announcement.first
             )
-            if replaced is not None:  # the origin was configured anew: what was delivered stays delivered
+            if replaced is None:
+                self._recall(stream)
+            else:  # the origin was configured anew: what was delivered stays delivered
                 stream.delivered, stream.confirmed = replaced.delivered, replaced.confirmed
                 stream.unhandled = replaced.unhandled
                 replaced.close()
@@ -150,6 +156,12 @@ class StreamsIn:
             self.watermarks[channel_id] = stream.confirmed  # it may not know: ours was lost with the session
         if wanted is not None:
             self._answers.answer(stream, wanted, now=now)
+
+    def _recall(self, stream: InStream) -> None:
+        """What was delivered of a durable stream stays so when it comes back: its origin may know less than we do."""
+        delivered, confirmed = self._had.pop(stream.stream.id, (0, 0))
+        stream.delivered = max(stream.delivered, delivered)
+        stream.confirmed = max(stream.confirmed, confirmed)
 
     def _offer(self, stream: InStream, announcement: Announcement, now: float) -> bool | None:
         """The owner's answer to an announcement. Raises RefusedError, also when it fails twice."""
@@ -194,6 +206,11 @@ class StreamsIn:
     def retract(self, stream: InStream, now: float) -> None:
         """The peer no longer has the stream."""
         self.hand_on(now)
+        if stream.stream.spec.durable:
+            handled = stream.unhandled - 1 if stream.unhandled else stream.delivered
+            self._had[stream.stream.id] = (handled, min(stream.confirmed, handled))
+            while len(self._had) > MAX_REMEMBERED:
+                del self._had[next(iter(self._had))]
         self.streams.pop(stream.stream.id, None)
         self._missing.pop(stream.stream.id, None)
         self._texts.use_incoming(stream.stream.id, "")

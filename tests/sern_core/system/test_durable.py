@@ -161,3 +161,24 @@ def test_who_goes_shortly_before_the_relay_dies_gets_nothing_twice() -> None:
     play.site = play.world.restart_client("site")
     got = [*before, *play.finish()]
     assert got == sorted(set(got)) and len(got) > len(before) > 10
+
+
+def test_a_site_knows_what_it_has_of_a_stream_that_was_gone_for_a_while() -> None:
+    """The relay dies before what it has handed on is on its disk, and the robot with it. The next relay delivers what
+    it has and lets go of the stream, and only then the robot is back, with what nobody has confirmed to it."""
+    play = Play(10)
+    assert play.relay is not None
+    play.world.run(1.0)
+    play.relay.disk.full = True
+    play.world.run(1.0)
+    dead = play.robot.client
+    play.world.restart_relay()
+    play.relay.disk.full = False
+    play.relay.begin()
+    dead.core.link.disconnected(now=dead.now)
+    play.world.hops["robot"].break_connection()
+    again = play.world.restart_client("robot")
+    play.world.run(20.0)
+    play.robot.begin(again)
+    play.world.run(3.0)
+    play.check()
