@@ -46,6 +46,7 @@ def test_what_it_has_learned_is_there_in_the_next_run(tmp_path: Path) -> None:
     assert again.tried == 50
 
 
+@pytest.mark.interpreted  # no line of compiled code is seen
 @pytest.mark.parametrize("name", TARGETS)
 def test_each_target_takes_its_seeds_and_some_more(name: str, tmp_path: Path) -> None:
     target = TARGETS[name]
