@@ -27,14 +27,14 @@ DOCUMENT: Final = ROOT / "docs" / "install.md"
 PYTHONS: Final = ("3.11", "3.12", "3.13")
 EXTRAS: Final = ("dds", "zenoh", "foxglove", "lossy", "twin", "viz", "geo", "seg", "sim", "report")
 GLIBC_MINORS: Final = range(17, 40)
-"""Of glibc 2: from manylinux2014 to that of Ubuntu 24.04."""
+"""Minor versions of glibc 2, from that of manylinux2014 to that of Ubuntu 24.04."""
 PLATFORMS: Final = ("manylinux2014_aarch64", *(f"manylinux_2_{minor}_aarch64" for minor in GLIBC_MINORS))
 """The lowest first: pip takes the wheel that asks for least."""
 
 
 @dataclass(frozen=True, slots=True)
 class Wheel:
-    """What pip would take. `glibc_minor`: of glibc 2, at the least; 0: it runs anywhere."""
+    """What pip would take. `glibc_minor`: the least of glibc 2 that it runs with; 0: any."""
 
     name: str
     glibc_minor: int

@@ -10,7 +10,7 @@ from sern_client.endpoints.base import CountingEndpoint, MeasuredEndpoint
 from sern_client.guard import Guard
 from sern_client.link_state import LinkState
 from sern_client.operating import Operating
-from sern_client.spool.spool import register_spool
+from sern_client.spool.spool_metrics import register_spool
 from sern_client.summaries.client_summaries import register_summaries
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.collector import CollectorWatch

@@ -53,7 +53,7 @@ class Commands:
         self.holding: Holding | None = None
         """Who of several operators is obeyed; None: all are."""
         self.e_stops: EStops | None = None
-        """While one is latched no command is obeyed; None: this site has none."""
+        """The e-stops of this site: while one is latched no command is obeyed. None: there are none."""
         self._site = site
         self._core = core
         self._guard = guard
@@ -147,7 +147,7 @@ class Commands:
         return False
 
     def close(self) -> None:
-        """Before the endpoint is stopped: a robot that is being commanded is told to stand still, at once."""
+        """Tell every robot that is being commanded to stand still, at once. Call it before the endpoint is stopped."""
         self._timer.close()
         for command in self._open.values():
             self._stop(command)

@@ -5,9 +5,7 @@ import json
 import logging
 import secrets
 import time
-from collections.abc import Callable
 from contextlib import AsyncExitStack
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -20,8 +18,6 @@ from sern_client.bridge import Bridge
 from sern_client.checks import TableCheck
 from sern_client.client_metrics import Counting, register_client
 from sern_client.connection import Connection
-from sern_client.durable import DurableTopics
-from sern_client.e_stop import RELEASE_SUFFIX, EStops
 from sern_client.endpoints.base import (
     BothTold,
     Endpoint,
@@ -30,19 +26,17 @@ from sern_client.endpoints.base import (
     ShowingEndpoint,
     viewers_of,
 )
-from sern_client.endpoints.composite import with_services
-from sern_client.factory import e_stops_of, local_encoding, make_endpoint, make_link_topics
+from sern_client.factory import local_encoding, make_endpoint, make_link_topics
 from sern_client.guard import Guard
 from sern_client.keyring import ClientKeyring, KeyFiles
 from sern_client.link_news import SILENT, LinkNews
 from sern_client.link_state import LinkState
+from sern_client.making import durable_maker, keep_holders, make_e_stops, rule_of, services_maker, spool_maker
 from sern_client.on_demand import OnDemand
 from sern_client.operating import Operating
 from sern_client.scene.making import make_scene
-from sern_client.services import ServiceBridge
 from sern_client.site import Site
 from sern_client.site_objects import CoreObjects
-from sern_client.spool.spool import Spool
 from sern_client.tables import Tables
 from sern_client.told import ClientTold
 from sern_client.views import ClientViews
@@ -52,17 +46,15 @@ from sern_core.site.client import ClientCore, ClientEvents
 from sern_core.topics.patterns import PatternSet, compile_pattern
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.key_news import ClientKeys, RelayKeys
-from sern_core.vocabulary.message import TopicInfo, TopicSpec
 from sern_core.vocabulary.trace import DecisionTrace
-from sern_core.vocabulary.types import CLASS_LABELS, DropReason, Encoding, ObjectKind, TopicName
+from sern_core.vocabulary.types import CLASS_LABELS, DropReason, ObjectKind
 from sern_core.wire import framing
 from sern_runtime import clock, ros_types
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.codec_pool import CodecPool, make_coder
 from sern_runtime.collector import CollectorWatch
-from sern_runtime.config.client import ClientFile, ServicesSection, load_client
+from sern_runtime.config.client import ClientFile, load_client
 from sern_runtime.config.load import Loaded
-from sern_runtime.durable.disk import Disk
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.events import EventLog
 from sern_runtime.http_routes import Health
@@ -151,11 +143,11 @@ class ClientDaemon:
             self._make_core,
             discovery,
             self,
-            make_services=self._services(endpoint),
+            make_services=services_maker(loaded, endpoint, self._kick),
             guard=self.guard,
             goals=self._make_goals(),
-            make_durable=self._durable(),
-            make_spool=self._make_spool(),
+            make_durable=durable_maker(loaded),
+            make_spool=spool_maker(loaded, self.site),
             withdraws=state.withdraw_after_s is not None,
         )
         self.core = self.bridge.core
@@ -165,8 +157,8 @@ class ClientDaemon:
         self.scene = make_scene(loaded, endpoint, self.site, objects, local_encoding(model))
         self.on_demand = self._make_on_demand(endpoint, objects)
         self.adaptation = self._make_adaptation()
-        self.e_stops = self._make_e_stops()
-        self._keep_holders()
+        self.e_stops = make_e_stops(loaded, self.bridge, self.events)
+        keep_holders(loaded, self.bridge)
         self.operating = Operating(
             loaded,
             self.bridge,
@@ -232,50 +224,6 @@ class ClientDaemon:
             core.link.end.fates = LoggedFates(self.message_log, self.parts)
         return core
 
-    def _durable(self) -> Callable[[ClientCore], DurableTopics] | None:
-        """What makes the keeper of durable topics; None: there is no place for them."""
-        section = self.loaded.model.durable
-        if section is None:
-            return None
-        disk = Disk.within(self.loaded.resolve(section.directory), max_bytes=section.max_bytes)
-        return lambda core: DurableTopics(disk, core=core, now=clock.now)
-
-    def _make_spool(self) -> Callable[[ClientCore], Spool] | None:
-        """What makes the spool; None: nothing is kept here or fetched."""
-        section = self.loaded.model.spool
-        if section is None:
-            return None
-        directory = self.loaded.resolve(section.directory)
-        return lambda core: Spool(core, self.site, section, directory)
-
-    def _rule_of(self, info: TopicInfo) -> TopicSpec:
-        """How a topic of this site is treated, by its global name."""
-        name = self.site.rules.inward(info.name, namespace=self.site.namespace)
-        return self.site.rules.resolve(replace(info, name=name), local_name=name).spec
-
-    def _make_e_stops(self) -> EStops:
-        """The e-stops of the file; they are told of messages, and listen for their release."""
-        bridge, (stops, path) = self.bridge, e_stops_of(self.loaded)
-        made = EStops(stops, path, self.events, halt=bridge.inbound.commands.halt)
-        if stops:
-            bridge.inbound.e_stops = bridge.outbound.e_stops = bridge.inbound.commands.e_stops = made
-        for stop in stops:
-            name = self.site.rules.outward(TopicInfo(stop.topic, "", Encoding.CDR), local_name=stop.topic,
-                                           namespace=self.site.namespace)  # fmt: skip
-            release = partial(made.release, stop.topic)
-            bridge.asking.listen(TopicName(f"{name}{RELEASE_SUFFIX}"), lambda who, _text, do=release: do(who=who))  # type: ignore[misc]
-        return made
-
-    def _keep_holders(self) -> None:
-        """Have one operator at a time command each topic of this robot whose rule says so."""
-        for section in self.loaded.model.topics:
-            if section.holder is None or not section.direction.receives:
-                continue
-            local = TopicName(section.match)
-            info = TopicInfo(local, "", Encoding.CDR)
-            name = self.site.rules.outward(info, local_name=local, namespace=self.site.namespace)
-            self.bridge.holding.keep(local, name, section.holder.lapse_s)
-
     def _make_keyring(self) -> ClientKeyring | None:
         relay = self.loaded.model.relay
         if relay.secret_key_file is None or relay.server_key_file is None:
@@ -338,23 +286,6 @@ class ClientDaemon:
                 parts=self.parts,
             )
 
-    def _services(self, endpoint: Endpoint) -> Callable[[ClientCore], ServiceBridge] | None:
-        """What makes the bridge of services, where the file has rules for them; then an endpoint must know services."""
-        model = self.loaded.model
-        offer, use = model.offered_services(), model.used_services()
-        if not offer and not use:
-            return None
-        known = with_services(endpoint)
-        if known is not None:
-            return partial(
-                ServiceBridge, endpoint=known, offer=offer, use=use, namespace=model.namespace, kick=self._kick
-            )
-        if model.services == ServicesSection():
-            return None  # actions of ROS 1 are topics
-        with blamed_on(self.loaded.path, "services"):
-            kinds = " and ".join(dict.fromkeys(section.kind for section in model.endpoints))
-            raise ConfigError(f"an endpoint of kind {kinds} has no services; leave the section out")
-
     async def start(self) -> None:
         self.errors.watch(asyncio.get_running_loop())
         self.collector.watch()
@@ -369,7 +300,7 @@ class ClientDaemon:
                 await self._http.start()
         if self.bridge.durable is not None:  # before the endpoint, whose topics go on where they were
             with blamed_on(self.loaded.path, "durable", "directory"):
-                self.bridge.durable.start(self._rule_of)
+                self.bridge.durable.start(partial(rule_of, self.site))
         if self.bridge.spool is not None:  # before the endpoint, whose topics it keeps
             with blamed_on(self.loaded.path, "spool", "directory"):
                 self.bridge.spool.start()

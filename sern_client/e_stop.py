@@ -14,15 +14,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from sern_client.endpoints.base import Sink
 from sern_core.topics.patterns import PatternSet
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.names import plain_type
 from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime.events import EventLog, wall_text
+from sern_runtime.whole_file import write_whole
 
 RELEASE_SUFFIX: Final = "/release"
-"""Below an e-stop's name: a message there, from whoever may publish the stop, releases it."""
+"""The topic of this name below an e-stop's: a message there, from whoever may publish the stop, releases it."""
 MAX_FILE_BYTES: Final = 64 * 1024
 
 _log = logging.getLogger(__name__)
@@ -91,6 +93,15 @@ class EStops:
             words = "%s: stopped by %s; commands are refused until `sern release %s`"
             self._events.say(_log, logging.WARNING, "e_stop", info.name, words, info.name, where, info.name)
 
+    def sink(self, info: TopicInfo, inner: Sink) -> Sink:
+        """What takes the messages of a topic of this site in place of `inner`, and hears them."""
+
+        def watched(body: bytes, stamp_ns: int) -> bool:
+            self.heard(info, body, where="this site")
+            return inner(body, stamp_ns)
+
+        return watched
+
     def release(self, topic: TopicName, *, who: str) -> None:
         """Obey commands again. Raises UsageError for a topic that is none or is not latched."""
         if topic not in self._stops:
@@ -122,19 +133,9 @@ class EStops:
             raise ConfigError(text)
 
     def _write(self) -> None:
-        """On disk when it returns. Where that fails the latch holds all the same, until the end of the process."""
-        beside = self._path.with_name(self._path.name + ".new")
+        """Have it on disk. Where that fails the latch holds all the same, until the end of the process."""
         try:
-            with beside.open("w", encoding="utf-8") as file:
-                json.dump(self._latched, file)
-                file.flush()
-                os.fsync(file.fileno())
-            beside.replace(self._path)
-            folder = os.open(self._path.parent, os.O_RDONLY | os.O_DIRECTORY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
+            write_whole(self._path, json.dumps(self._latched))
         except OSError as error:
             words = "%s: the state of the e-stops could not be kept (%s): it ends with this process"
             self._events.say(_log, logging.ERROR, "e_stop_not_kept", "", words, self._path, error.strerror)

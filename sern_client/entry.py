@@ -1,4 +1,4 @@
-"""Where an endpoint hands the messages of one topic over. They may be held here while the topic is being changed."""
+"""Takes the messages of one topic from its endpoint. They may be held here while the topic is being changed."""
 
 from collections import deque
 from typing import Final, NamedTuple

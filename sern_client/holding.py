@@ -14,13 +14,14 @@ from functools import partial
 from typing import Any, Final
 
 from sern_client.asking import SPEC, TEXT_TYPE, Asking
+from sern_client.endpoints.base import Sink
 from sern_client.site import Site
 from sern_core.site.client import ClientCore
 from sern_core.site.hold import Hold
 from sern_core.stream.out_channel import OutChannel
 from sern_core.vocabulary.errors import SernError, UsageError
 from sern_core.vocabulary.ledger import MAX_TOPICS
-from sern_core.vocabulary.types import ClientName, Durability, Encoding, TopicName
+from sern_core.vocabulary.types import ClientName, DropReason, Durability, Encoding, TopicName
 from sern_runtime import clock, ros_types
 
 TAKE: Final = "/take"
@@ -134,7 +135,7 @@ class Holding:
 
     # --- at an operator ---------------------------------------------------------------------------------------------
 
-    def follow(self, name: TopicName) -> None:
+    def _follow(self, name: TopicName) -> None:
         """This site sends commands on a topic (global name): be told who holds it."""
         self._refused.discard(name)  # who begins anew may hold it by commanding
         if name in self._told or len(self._told) >= MAX_TOPICS:
@@ -142,6 +143,19 @@ class Holding:
         self._told[name] = None
         self._asking.listen(TopicName(f"{name}{HOLDER}"), partial(self._hear, name))
         self._subscribe(self._asking.topics)
+
+    def sink(self, channel: OutChannel, inner: Sink) -> Sink:
+        """What takes commands from here in place of `inner`: none goes on while another operator holds the topic."""
+        name = channel.stream.id.topic
+        self._follow(name)
+
+        def withheld(body: bytes, stamp_ns: int) -> bool:
+            if self.withholds(name):
+                self._core.drop(channel, len(body), DropReason.NOT_HOLDER, now=clock.now())
+                return True
+            return inner(body, stamp_ns)
+
+        return withheld
 
     def withholds(self, name: TopicName) -> bool:
         """Whether a command from here is not sent: another operator holds the topic, or did and nobody does now."""

@@ -18,67 +18,34 @@ Hold = Callable[[StreamId, int], None]
 Release = Callable[[StreamId, int, DropReason | None], None]
 """`release(stream, seq, lost)`: it is kept, or was lost for a reason."""
 
-Numbers = tuple[int, ...]
+Told = Callable[[StreamId, int, DropReason | None], None]
+"""`told(stream, seq, lost)`, once for each keeper of a message: that one keeps it, or lost it for a reason."""
 
+Numbers = tuple[int, ...]
 
 SOON_S: Final = 0.005
 """Least wait of a reliable message before it is flushed, so that many are flushed together."""
 
 
-class Keeping:
-    """Holds what waits for `keepers`. `mark` before a message is published, `published` after it. `soon` is called with
-    the delay after which `keep_soon` should be."""
+class KeeperNumbers:
+    """Which message has which number at which of `keepers`. `mark` before a message is published, `published` after."""
 
-    def __init__(
-        self, keepers: Sequence[KeepingEndpoint], hold: Hold, release: Release, soon: Callable[[float], None]
-    ) -> None:
-        self._keepers = list(keepers)
-        self._hold = hold
-        self._release = release
-        self._soon = soon
-        self._asked = False
-        self._waiting: list[deque[tuple[int, StreamId, int]]] = [deque() for _ in self._keepers]  # in order of number
-        self._left: dict[tuple[StreamId, int], int] = {}  # message -> keepers that have not kept it
-        for index, keeper in enumerate(self._keepers):
+    def __init__(self, keepers: Sequence[KeepingEndpoint], told: Told) -> None:
+        self.keepers = list(keepers)
+        self._told = told
+        self._waiting: list[deque[tuple[int, StreamId, int]]] = [deque() for _ in self.keepers]  # in order of number
+        for index, keeper in enumerate(self.keepers):
             keeper.watch_kept(lambda upto, lost, index=index: self._kept(index, upto, lost))  # type: ignore[misc]
 
-    def __bool__(self) -> bool:
-        return bool(self._keepers)
-
-    @property
-    def pending(self) -> int:
-        """Messages that are not confirmed because they are not kept yet."""
-        return len(self._left)
-
     def mark(self) -> Numbers:
-        return tuple(keeper.taken for keeper in self._keepers)
+        return tuple(keeper.taken for keeper in self.keepers)
 
-    def published(self, stream: StreamId, seq: int, mark: Numbers) -> bool:
-        """The keepers that have taken something since `mark` have taken this message. False: there are none, and it is
-        not held."""
-        took = [i for i, keeper in enumerate(self._keepers) if keeper.taken > mark[i]]
-        if not took:
-            return False
-        self._left[stream, seq] = len(took)
-        self._hold(stream, seq)
-        if not self._asked:
-            self._asked = True
-            self._soon(SOON_S)
+    def published(self, stream: StreamId, seq: int, mark: Numbers) -> int:
+        """The keepers that have taken something since `mark` have taken this message; returns how many."""
+        took = [i for i, keeper in enumerate(self.keepers) if keeper.taken > mark[i]]
         for index in took:
-            self._waiting[index].append((self._keepers[index].taken, stream, seq))
-        return True
-
-    def keep_soon(self) -> None:
-        """Have what waits kept, if that is cheap."""
-        self._asked = False
-        if self._left:
-            for keeper in self._keepers:
-                keeper.keep_soon()
-
-    def flush(self) -> None:
-        """Have everything kept now."""
-        for keeper in self._keepers:
-            keeper.flush()
+            self._waiting[index].append((self.keepers[index].taken, stream, seq))
+        return len(took)
 
     def _kept(self, index: int, upto: int, lost: Mapping[int, DropReason]) -> None:
         waiting = self._waiting[index]
@@ -89,8 +56,59 @@ class Keeping:
             if number > upto and number not in lost:
                 again.append((number, stream, seq))
                 continue
-            self._one(stream, seq, lost.get(number))
+            self._told(stream, seq, lost.get(number))
         waiting.extendleft(reversed(again))
+
+
+class Keeping:
+    """Holds what waits for `keepers`. `mark` before a message is published, `published` after it. `soon` is called with
+    the delay after which `keep_soon` should be."""
+
+    def __init__(
+        self, keepers: Sequence[KeepingEndpoint], hold: Hold, release: Release, soon: Callable[[float], None]
+    ) -> None:
+        self._numbers = KeeperNumbers(keepers, self._one)
+        self._hold = hold
+        self._release = release
+        self._soon = soon
+        self._asked = False
+        self._left: dict[tuple[StreamId, int], int] = {}  # message -> keepers that have not kept it
+
+    def __bool__(self) -> bool:
+        return bool(self._numbers.keepers)
+
+    @property
+    def pending(self) -> int:
+        """Messages that are not confirmed because they are not kept yet."""
+        return len(self._left)
+
+    def mark(self) -> Numbers:
+        return self._numbers.mark()
+
+    def published(self, stream: StreamId, seq: int, mark: Numbers) -> bool:
+        """The keepers that have taken something since `mark` have taken this message. False: there are none, and it is
+        not held."""
+        took = self._numbers.published(stream, seq, mark)
+        if not took:
+            return False
+        self._left[stream, seq] = took
+        self._hold(stream, seq)
+        if not self._asked:
+            self._asked = True
+            self._soon(SOON_S)
+        return True
+
+    def keep_soon(self) -> None:
+        """Have what waits kept, if that is cheap."""
+        self._asked = False
+        if self._left:
+            for keeper in self._numbers.keepers:
+                keeper.keep_soon()
+
+    def flush(self) -> None:
+        """Have everything kept now."""
+        for keeper in self._numbers.keepers:
+            keeper.flush()
 
     def _one(self, stream: StreamId, seq: int, lost: DropReason | None) -> None:
         left = self._left.get((stream, seq))

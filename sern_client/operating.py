@@ -103,7 +103,7 @@ class Operating:
 
     @property
     def socket(self) -> Path | None:
-        """Where it listens; None: nowhere."""
+        """The socket on which it listens; None: there is none."""
         return None if self._server is None else self._server.path
 
     # --- the file anew ----------------------------------------------------------------------------------------------

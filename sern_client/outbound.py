@@ -230,9 +230,9 @@ class Outbound:
         if self._goals is not None:
             sink = self._goals.outgoing(info, channel, sink)
         if self.holding is not None and resolved.hold_lapse_s is not None:
-            sink = self._withheld(channel, sink, self.holding)
+            sink = self.holding.sink(channel, sink)
         if self.e_stops is not None and info.name in self.e_stops.topics:
-            sink = self._watched(info, sink, self.e_stops)
+            sink = self.e_stops.sink(info, sink)
         if self._taps is not None and self._spooled(info.name, resolved, info.encoding):
             sink = self._taps.open(channel, rewrite, sink)
         return channel, source, Entry(sink, channel, send if sink is plain else None)
@@ -396,26 +396,6 @@ class Outbound:
         rewrite = self._site.frames.outgoing(info)
         keep = durable.sender(channel, self._send(channel, None, forced=True), self.stored.of(info))
         return lambda body, stamp_ns: keep(body if rewrite is None else rewrite(body), stamp_ns, None)
-
-    def _withheld(self, channel: OutChannel, sink: Sink, holding: Holding) -> Sink:
-        """What sends commands while no other operator holds their topic."""
-        name = channel.stream.id.topic
-        holding.follow(name)
-
-        def withheld(body: bytes, stamp_ns: int) -> bool:
-            if holding.withholds(name):
-                self._core.drop(channel, len(body), DropReason.NOT_HOLDER, now=clock.now())
-                return True
-            return sink(body, stamp_ns)
-
-        return withheld
-
-    def _watched(self, info: TopicInfo, sink: Sink, e_stops: EStops) -> Sink:
-        def watched(body: bytes, stamp_ns: int) -> bool:
-            e_stops.heard(info, body, where="this site")
-            return sink(body, stamp_ns)
-
-        return watched
 
     def _reckoned(self, info: TopicInfo, sink: Sink) -> Sink:
         from sern_client.reckoned import ReckonedPoses  # who does not ask for it need not load it

@@ -15,8 +15,9 @@ from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.names import name_problem
 from sern_core.vocabulary.types import TopicName
 from sern_runtime.config.adaptation import AdaptationSection
-from sern_runtime.config.client import ClientFile, TopicSection
+from sern_runtime.config.client import ClientFile
 from sern_runtime.config.load import checked_section
+from sern_runtime.config.topics import TopicSection
 from sern_runtime.config.yaml import parse_document
 
 SETTABLE: Final = (

@@ -13,7 +13,7 @@ from sern_runtime.watching.told import Adapting, Json
 
 
 class ClientTold:
-    """Of one client."""
+    """Tells of one client."""
 
     def __init__(self, bridge: Bridge, views: ClientViews, adaptation: Adaptation | None) -> None:
         self._core = bridge.core

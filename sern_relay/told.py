@@ -15,7 +15,7 @@ from sern_runtime.watching.told import Adapting, Json
 
 
 class RelayTold:
-    """Of one relay. `clients` is what the rows of /api/clients are made of."""
+    """Tells of one relay. `clients` is what the rows of /api/clients are made of."""
 
     def __init__(self, hub: Hub, clients: ClientsSource, adaptation: Adaptation | None) -> None:
         self._hub = hub

@@ -6,7 +6,7 @@ from typing import Final, cast
 
 MAX_CONNECTIONS: Final = 128
 MAX_OF_ONE_SOURCE: Final = 32
-"""So that one address does not take the places of all others."""
+"""Connections of one address, which could take the places of all others otherwise."""
 
 
 class HttpConnections:

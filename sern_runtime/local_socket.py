@@ -23,10 +23,11 @@ MAX_LINE_BYTES: Final = 64 * 1024
 MAX_CONNECTIONS: Final = 16
 REQUEST_S: Final = 5.0
 """Longest wait for a request on a connection that was made."""
+PROBE_S: Final = 1.0
 ANSWER_S: Final = 40.0
 """Longest wait of a tool for an answer: longer than a question to another site may take."""
 MAX_PATH_BYTES: Final = 107
-"""Of a unix socket's name, as the kernel has it."""
+"""The longest name of a unix socket that the kernel takes."""
 SUFFIX: Final = ".sock"
 
 Json = dict[str, Any]
@@ -37,23 +38,44 @@ _log = logging.getLogger(__name__)
 
 
 def socket_directory(environment: Mapping[str, str] = os.environ) -> Path:
-    """Where daemons of this user have their local sockets."""
+    """The directory in which daemons of this user have their local sockets."""
     unit, session = environment.get("RUNTIME_DIRECTORY"), environment.get("XDG_RUNTIME_DIR")
     if unit:
         return Path(unit.split(":")[0])
-    return Path(session) / "sern" if session else Path(f"/tmp/sern-{os.getuid()}")
+    return Path(session) / "sern" if session else _directory_in_tmp()
+
+
+def _directory_in_tmp() -> Path:
+    return Path(f"/tmp/sern-{os.getuid()}")
 
 
 def sockets(environment: Mapping[str, str] = os.environ) -> dict[str, Path]:
-    """The local sockets that this user can see, by the name of their client: of units, and of this user's own."""
-    run = Path("/run")
-    places = [socket_directory(environment), Path(f"/tmp/sern-{os.getuid()}"), *sorted(run.glob("sern-*"))]
+    """The local sockets that this user can see, by the name of their client: of units, and of this user's own. Left out
+    is what a daemon has left that was killed, and what others could have put into a directory of this user's: that
+    would answer in a daemon's place."""
+    own = (socket_directory(environment), _directory_in_tmp())
     found: dict[str, Path] = {}
-    for place in places:
+    for place in (*own, *sorted(Path("/run").glob("sern-*"))):  # of root's making alone
         with suppress(OSError):
+            if place in own and not _is_own(place):
+                continue
             for path in sorted(place.glob(f"*{SUFFIX}")):
-                found.setdefault(path.name.removesuffix(SUFFIX), path)
+                if not _is_left(path):
+                    found.setdefault(path.name.removesuffix(SUFFIX), path)
     return found
+
+
+def _is_left(path: Path) -> bool:
+    """Whether nobody listens on a socket any more."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.settimeout(PROBE_S)
+        try:
+            probe.connect(str(path))
+        except (ConnectionRefusedError, FileNotFoundError):
+            return True
+        except OSError:  # such as one that is not ours to speak to: that is said when it is asked
+            return False
+    return False
 
 
 def ask(path: Path, request: Json, *, timeout_s: float = ANSWER_S) -> Json:
@@ -171,22 +193,20 @@ def _listener(path: Path) -> socket.socket:
     return listener
 
 
-def _own_directory(directory: Path) -> None:
-    """In a directory that others may write to, somebody else could answer in the daemon's place."""
-    directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+def _is_own(directory: Path) -> bool:
+    """Whether it is a directory of this user alone. Raises OSError where there is none."""
     seen = directory.lstat()
-    if not stat.S_ISDIR(seen.st_mode) or seen.st_uid != os.getuid() or seen.st_mode & 0o022:
+    return stat.S_ISDIR(seen.st_mode) and seen.st_uid == os.getuid() and not seen.st_mode & 0o022
+
+
+def _own_directory(directory: Path) -> None:
+    directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if not _is_own(directory):
         raise ConfigError(f"{directory}: is not a directory of this user alone; remove it, or set local.socket")
 
 
 def _take_over(path: Path) -> None:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-        probe.settimeout(1.0)
-        try:
-            probe.connect(str(path))
-        except ConnectionRefusedError:
-            path.unlink()
-            return
-        except OSError as error:
-            raise ConfigError(f"{path}: {error.strerror or error}; remove it, or set local.socket") from error
-    raise ConfigError(f"{path}: another daemon has it; give one of the two local.socket")
+    """Raises ConfigError for a socket on which somebody listens."""
+    if not _is_left(path):
+        raise ConfigError(f"{path}: another daemon has it; remove it, or give one of the two local.socket")
+    path.unlink(missing_ok=True)

@@ -13,7 +13,7 @@ from sern_core.vocabulary.errors import ConfigError
 OPEN_FILES: Final = 16_384
 """How many files a daemon wants to be able to open, one for each connection; as in the systemd units."""
 RESERVED_FILES: Final = 600
-"""For all the connections that may wait to be accepted (`zmq_setup.BACKLOG`), and to look at each of them."""
+"""Enough for all the connections that may wait to be accepted (`zmq_setup.BACKLOG`), and to look at each."""
 _LEAST_FILES: Final = 256
 """There is no reserve where less than this would be left beside it."""
 _log = logging.getLogger(__name__)

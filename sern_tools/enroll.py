@@ -32,7 +32,6 @@ from sern_runtime.config.keys import (
     fingerprint,
     generate,
     load_public,
-    sync_directory,
     write_public,
     write_secret,
 )
@@ -47,6 +46,7 @@ from sern_runtime.enrolment import (
     State,
     new_code,
 )
+from sern_runtime.whole_file import sync_directory
 from sern_tools.keys import RELAY_FILE, clients_dir, reported, running_relay
 
 PROGRAM: Final = "sern enroll"

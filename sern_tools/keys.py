@@ -33,7 +33,6 @@ from sern_runtime.config.keys import (
     fingerprint,
     generate,
     load_secret,
-    sync_directory,
     utc,
     write_public,
     write_secret,
@@ -41,6 +40,7 @@ from sern_runtime.config.keys import (
 from sern_runtime.config.load import Loaded
 from sern_runtime.config.relay import RelayFile, load_relay
 from sern_runtime.config.yaml import read_document
+from sern_runtime.whole_file import sync_directory
 from sern_tools.api import get_json, say
 from sern_tools.check import detect
 

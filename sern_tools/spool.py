@@ -175,7 +175,7 @@ def spool_fetch(
 
 
 def _wait(where: str, topic: str, order: Path) -> None:
-    """Until the client has taken the order away. Raises SernError."""
+    """Wait until the client has taken the order away. Raises SernError."""
     said = ""
     while order.exists():
         row = next((row for row in get_json(where, PATH)["fetch"] if row["topic"] == topic), None)

@@ -8,7 +8,7 @@ from typing import Final
 from tests.daemons import HOST
 
 INSIDE: Final = "127.0.0.2"
-"""Where the client finds the relay; only what is between them knows that it is elsewhere."""
+"""The address at which the client finds the relay; only what is between them knows that it is elsewhere."""
 ANY: Final = ("", 0)
 
 

@@ -14,7 +14,7 @@ from sern_core.vocabulary.types import Encoding
 from sern_twin.world.grid import Grid
 
 POSES: Final = 200
-"""So many of a robot are kept: 4 s at 50 Hz."""
+"""Poses of a robot that are kept: 4 s at 50 Hz."""
 APART_S: Final = 0.2
 """How far a scan may be from the poses that it lies between."""
 MOST_MARKERS: Final = 200

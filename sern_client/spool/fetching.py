@@ -4,14 +4,15 @@ import asyncio
 import logging
 import secrets
 import time
-from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 from sern_client.endpoints.base import KeepingEndpoint
 from sern_client.frames import Rewrite
+from sern_client.keeping import KeeperNumbers, Numbers
 from sern_client.site import Site
 from sern_client.spool import ledger, orders
 from sern_core.site.client import ClientCore
@@ -46,7 +47,7 @@ SILENT_S: Final = 120.0
 """A robot that has sent nothing of what it was asked for so long is asked again."""
 
 NOBODY: Final = ClientName("")
-"""Where a topic is from that was kept once, and that nobody offers now."""
+"""The origin of a topic that was kept once, and that nobody offers now."""
 
 _log = logging.getLogger(__name__)
 
@@ -72,35 +73,6 @@ class _Remote:
     nbytes: int = 0
 
 
-class _LiveMarks:
-    """Which live messages are safe in a recording, and since when: as `Keeping`, also for best effort."""
-
-    def __init__(self, keepers: Sequence[KeepingEndpoint], have: Callable[[StreamId, int], None]) -> None:
-        self._keepers = list(keepers)
-        self._have = have
-        self._waiting: list[deque[tuple[int, StreamId, int]]] = [deque() for _ in self._keepers]
-        for index, keeper in enumerate(self._keepers):
-            keeper.watch_kept(lambda upto, lost, index=index: self._kept(index, upto, lost))  # type: ignore[misc]
-
-    def mark(self) -> tuple[int, ...]:
-        return tuple(keeper.taken for keeper in self._keepers)
-
-    def published(self, stream: StreamId, seq: int, mark: tuple[int, ...]) -> None:
-        """A message was published since `mark`: here it is, or it will be when its recording is flushed."""
-        took = [index for index, keeper in enumerate(self._keepers) if keeper.taken > mark[index]]
-        for index in took:
-            self._waiting[index].append((self._keepers[index].taken, stream, seq))
-        if not took:
-            self._have(stream, seq)
-
-    def _kept(self, index: int, upto: int, lost: Mapping[int, DropReason]) -> None:
-        waiting = self._waiting[index]
-        while waiting and waiting[0][0] <= upto:
-            number, stream, seq = waiting.popleft()
-            if number not in lost:
-                self._have(stream, seq)
-
-
 class SpoolFetching:
     """`start` once the loop runs, `look` about twice a second, then `close`. `topics`: global names to fetch;
     `automatic`: without being asked."""
@@ -115,19 +87,16 @@ class SpoolFetching:
         automatic: bool,
         keepers: Sequence[KeepingEndpoint],
     ) -> None:
-        self.fetched = 0
-        self.fetched_bytes = 0
         self.unasked = 0
         """Messages that came as fetched and were not asked for, or are here already."""
         self.refused = 0
         """Messages from robots that are not what they ought to be."""
-        self.ledger_failures = 0
         self._core = core
         self._site = site
         self._keeper = keeper
         self._topics = topics
         self._automatic = automatic
-        self._marks = _LiveMarks(keepers, self._have_live)
+        self._live = KeeperNumbers(keepers, self._live_kept)
         self._remotes: dict[TopicName, _Remote] = {}
         self._orders: dict[Path, orders.Order] = {}
         self._ordered_s: dict[Path, float] = {}  # since when each is known
@@ -267,16 +236,15 @@ class SpoolFetching:
                 remote.fetch.recorded(message.stream.id.boot, message.seq)
                 remote.messages += 1
                 remote.nbytes += len(message.body)
-                self.fetched += 1
-                self.fetched_bytes += len(message.body)
                 self._changed = True
             else:
                 remote.fetch.lost(message.stream.id.boot, message.seq)
 
     # --- what comes live --------------------------------------------------------------------------------------------
 
-    def mark(self, stream: StreamId) -> tuple[int, ...] | None:
-        """Before a live message is published; None: its topic is not fetched."""
+    def mark(self, stream: StreamId) -> Numbers | None:
+        """Call it before a live message is published. Returns what `published` is to be given; None: its topic is not
+        fetched."""
         remote = self._remotes.get(stream.topic) or self._maybe_kept(stream.topic)
         if remote is None:
             return None
@@ -285,7 +253,7 @@ class SpoolFetching:
         if remote.origin != stream.origin:
             return None
         remote.fetch.began(stream.boot)
-        return self._marks.mark()
+        return self._live.mark()
 
     def _maybe_kept(self, topic: TopicName) -> _Remote | None:
         """A live topic that its robot may turn out to keep: what came before it says so must be known then."""
@@ -298,12 +266,15 @@ class SpoolFetching:
         remote = self._remotes[topic] = _Remote(topic, TopicFetch(secrets.randbits(62)))
         return remote
 
-    def published(self, stream: StreamId, seq: int, mark: tuple[int, ...]) -> None:
-        self._marks.published(stream, seq, mark)
+    def published(self, stream: StreamId, seq: int, mark: Numbers) -> None:
+        """A live message was published since `mark`. What no recording has taken is here all the same."""
+        if not self._live.published(stream, seq, mark):
+            self._live_kept(stream, seq, None)
 
-    def _have_live(self, stream: StreamId, seq: int) -> None:
+    def _live_kept(self, stream: StreamId, seq: int, lost: DropReason | None) -> None:
+        """A recording has a live message, or lost it: then it is missing, unless another one has it."""
         remote = self._remotes.get(stream.topic)
-        if remote is not None:
+        if remote is not None and lost is None:
             remote.fetch.have(stream.boot, seq, seq)
             self._changed = True
 
@@ -417,7 +388,6 @@ class SpoolFetching:
             raise error
 
     def _save_failed(self, error: OSError) -> None:
-        self.ledger_failures += 1
         self._changed = True
         self._say_once(
             f"{self.directory / ledger.FILE} cannot be written ({error.strerror}): what is fetched now is fetched "

@@ -2,13 +2,13 @@
 
 import json
 import logging
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
 from sern_core.site.runs import Run
 from sern_core.vocabulary.types import TopicName
+from sern_runtime.whole_file import write_whole
 
 FILE: Final = "ledger.json"
 VERSION: Final = 1
@@ -16,7 +16,7 @@ VERSION: Final = 1
 _log = logging.getLogger(__name__)
 
 Ledger = Mapping[TopicName, Mapping[int, tuple[Run, ...]]]
-"""By topic and boot number, the runs of seqs that are recorded."""
+"""The runs of seqs that are recorded, by topic and boot number."""
 
 
 def load(directory: Path) -> Ledger:
@@ -46,11 +46,5 @@ def load(directory: Path) -> Ledger:
 
 def save(directory: Path, ledger: Ledger) -> None:
     """Raises OSError. It is there whole, or as it was before."""
-    path = directory / FILE
-    made = path.with_name(f"{FILE}.new")
     topics = {topic: {str(boot): runs for boot, runs in boots.items()} for topic, boots in ledger.items()}
-    with made.open("w", encoding="utf-8") as file:
-        json.dump({"version": VERSION, "topics": topics}, file)
-        file.flush()
-        os.fsync(file.fileno())
-    made.replace(path)
+    write_whole(directory / FILE, json.dumps({"version": VERSION, "topics": topics}))

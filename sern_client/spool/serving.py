@@ -92,7 +92,6 @@ class SpoolServing:
         self._kick = kick
         self._offered: dict[TopicName, _Offered] = {}
         self._askers: dict[StreamId, _Asker] = {}
-        self._changes = -1
         self._timer = Timer(self._pump)
         self._said_bad = False
         self._closed = False

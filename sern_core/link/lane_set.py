@@ -49,8 +49,9 @@ class LaneSet:
         self.priority_lane: Lane | None = None
         """The lane that carries class control beside it, if there is one."""
         self.wire_bytes = 0
-        self.background_bytes = 0  # of those, fragments of streams in the background
         """Bytes of numbered datagrams sent so far, second copies and headers included."""
+        self.background_bytes = 0
+        """Those of them that were fragments of streams in the background."""
 
     @property
     def stream(self) -> Lane:

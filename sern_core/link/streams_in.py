@@ -60,8 +60,7 @@ class StreamsIn:
         self.watermarks: dict[int, int] = {}
         """Up to where a channel is delivered, where the peer is still to be told."""
         self._gone: deque[InStream] = deque()  # streams that the peer no longer has, to be retracted
-        self._had: dict[StreamId, tuple[int, int]] = {}
-        """Of durable streams that the peer has no longer, the latest: what was delivered here, and confirmed."""
+        self._had: dict[StreamId, tuple[int, int]] = {}  # durable ones that have ended: delivered, confirmed
         self._skipping: dict[InStream, None] = {}  # streams that leave messages out, and go on in a while
         self._missing: dict[StreamId, float] = {}  # not announced by a new peer, and since when
         self._fresh: deque[tuple[InStream, Message, int]] = deque()
@@ -159,7 +158,7 @@ class StreamsIn:
 
     def _recall(self, stream: InStream) -> None:
         """What was delivered of a durable stream stays so when it comes back: its origin may know less than we do."""
-        delivered, confirmed = self._had.pop(stream.stream.id, (0, 0))
+        delivered, confirmed = self._had.get(stream.stream.id, (0, 0))
         stream.delivered = max(stream.delivered, delivered)
         stream.confirmed = max(stream.confirmed, confirmed)
 
@@ -206,11 +205,7 @@ class StreamsIn:
     def retract(self, stream: InStream, now: float) -> None:
         """The peer no longer has the stream."""
         self.hand_on(now)
-        if stream.stream.spec.durable:
-            handled = stream.unhandled - 1 if stream.unhandled else stream.delivered
-            self._had[stream.stream.id] = (handled, min(stream.confirmed, handled))
-            while len(self._had) > MAX_REMEMBERED:
-                del self._had[next(iter(self._had))]
+        self._remember(stream)
         self.streams.pop(stream.stream.id, None)
         self._missing.pop(stream.stream.id, None)
         self._texts.use_incoming(stream.stream.id, "")
@@ -222,6 +217,16 @@ class StreamsIn:
         self._events.retract(stream, now=now)
         stream.close()
         stream.channel_id = None
+
+    def _remember(self, stream: InStream) -> None:
+        """Where a durable stream ends, for `_recall`; the latest of them."""
+        if not stream.stream.spec.durable:
+            return
+        delivered = stream.unhandled - 1 if stream.unhandled else stream.delivered
+        self._had.pop(stream.stream.id, None)
+        self._had[stream.stream.id] = (delivered, min(stream.confirmed, delivered))
+        if len(self._had) > MAX_REMEMBERED:
+            del self._had[next(iter(self._had))]
 
     # --- messages -------------------------------------------------------------------------------------------------
 

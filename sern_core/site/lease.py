@@ -30,7 +30,7 @@ MAX_RAMP_S: Final = 3.0
 INTERVALS: Final = 8
 """Times between commands that are remembered."""
 FEW: Final = 3
-"""With fewer than so many the usual time between commands is not known."""
+"""Times between commands that are needed to know the usual one."""
 
 
 class CommandLease:

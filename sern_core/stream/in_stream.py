@@ -227,7 +227,7 @@ class InStream:
         self.perishable = control and not self.reliable and self.lifespan_s is not None
         """A command or a pose: nobody shall have it too late."""
         self.newest_alone = self.perishable and stream.spec.depth == 1 and command
-        """Of commands that come together the robot gets the newest: after an outage there is no burst of them."""
+        """The robot gets the newest of commands that come together: after an outage there is no burst of them."""
         self.delivered = first - 1
         self.confirmed = first - 1  # what the peer was told (`StreamsIn.confirm`)
         self.unhandled = 0  # the first seq that had its turn and is still being decoded; 0: none

@@ -23,10 +23,10 @@ from sern_runtime.config.keys import (
     PublicKeys,
     is_key,
     load_public,
-    sync_directory,
     utc,
     write_public,
 )
+from sern_runtime.whole_file import sync_directory
 
 MAX_VALID: Final = 4
 """Keys of one client that hold at a time, as far as it adds them itself."""

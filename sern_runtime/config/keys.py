@@ -9,11 +9,8 @@ Every problem is a ConfigError of one line that names the file and never shows a
 
 import base64
 import hashlib
-import os
 import re
-import secrets
 import stat
-from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -31,6 +28,7 @@ from sern_core.vocabulary.types import ClientName
 from sern_runtime.config.base import ClientText, FileModel, Section, fault
 from sern_runtime.config.load import Loaded, check_document
 from sern_runtime.config.yaml import read_document
+from sern_runtime.whole_file import write_whole
 
 PUBLIC_SUFFIX: Final = ".pub"
 SECRET_SUFFIX: Final = ".key"
@@ -330,38 +328,12 @@ def write_secret(path: Path, key: SecretKey, *, replace: bool = False) -> None:
 
 
 def _write(path: Path, text: str, mode: int, *, replace: bool) -> None:
-    """Whatever happens meanwhile, the file is whole: as it was, or as it is to be."""
-    # A name of its own: two clients of one machine may write the relay's file at the same time.
-    target = path.with_name(f".{path.name}.{secrets.token_hex(8)}.new")
     try:
-        # O_EXCL: neither an existing file nor a link that someone placed there is followed.
-        descriptor = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
-        with os.fdopen(descriptor, "w", encoding="ascii") as stream:
-            stream.write(text)
-            stream.flush()
-            os.fsync(stream.fileno())
-        if replace:
-            target.replace(path)
-        else:
-            path.hardlink_to(target)
-            target.unlink()
-        sync_directory(path.parent)
+        write_whole(path, text, mode=mode, replace=replace)
     except FileExistsError as error:
         raise ConfigError("exists already; --force replaces it", file=str(path)) from error
     except OSError as error:
         raise ConfigError(f"can not be written: {error.strerror or error}", file=str(path)) from error
-    finally:
-        with suppress(OSError):  # of a folder that cannot be written, where it is not
-            target.unlink(missing_ok=True)
-
-
-def sync_directory(path: Path) -> None:
-    """Have what was renamed and removed in a folder outlive a loss of power. Raises OSError."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def user_id(name: ClientName, public_key: str) -> str:

@@ -210,7 +210,7 @@ class LocalSection(Section):
     listen: bool = True
     """Whether there is one. It has mode 0600: this client's user and root may use it."""
     socket: PathText | None = None
-    """Where it is; null: NAME.sock in the unit's runtime directory, else in $XDG_RUNTIME_DIR/sern or /tmp/sern-UID."""
+    """Its path; null: NAME.sock in the unit's runtime directory, else in $XDG_RUNTIME_DIR/sern or /tmp/sern-UID."""
 
 
 class LogSection(Section):

@@ -42,7 +42,7 @@ class Disk:
         return self._problem or (None if self.keeper is None else self.keeper.problem)
 
     def progress(self, *, now: float) -> int:
-        """For the watchdog, as `Keeper.progress`; where nothing is kept there is nothing that could be stuck."""
+        """What the watchdog looks at, as `Keeper.progress`: where nothing is kept nothing can be stuck."""
         if self.keeper is not None:
             return self.keeper.progress(now=now)
         self._looks += 1

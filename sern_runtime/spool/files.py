@@ -88,7 +88,7 @@ class Content:
             self.marks.append((seq, offset))
 
     def offset(self, seq: int) -> int:
-        """Where to begin to look for a seq."""
+        """The place in the file from which to look for a seq."""
         index = bisect_right(self.marks, seq, key=lambda mark: mark[0]) - 1
         return self.marks[max(index, 0)][1]
 
@@ -100,7 +100,7 @@ class FileIndex:
         self.path = path
         self.size_bytes = 0
         self.contents: dict[int, Content] = {}
-        """By channel."""
+        """What there is of each channel."""
         self.problem: str | None = None
 
     @property

@@ -66,8 +66,6 @@ class SpoolKeeper:
         self.topics: Mapping[TopicName, tuple[Span, ...]] = {}
         """What there is, as of the last flush."""
         self.streams: Mapping[TopicName, KeptStream] = {}
-        self.changes = 0
-        """Rises with every change of `topics`."""
         self._call_soon = call_soon
         self._on_kept = on_kept
         self._jobs: SimpleQueue[Kept | _Read | _Order] = SimpleQueue()
@@ -237,7 +235,6 @@ class SpoolKeeper:
 
     def _look(self) -> None:
         self.topics, self.streams = self.store.topics(), self.store.streams()
-        self.changes += 1
 
     def _tell(self, call: Callable[..., None], *args: object) -> None:
         with suppress(RuntimeError):  # the loop is closed: nobody waits any more

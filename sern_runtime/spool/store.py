@@ -209,7 +209,7 @@ class Store:
         }
 
     def streams(self) -> dict[TopicName, KeptStream]:
-        """Of each topic the stream that was kept last."""
+        """The stream of each topic that was kept last."""
         contents = (content for index in self._indexes() for content in index.contents.values())
         return {content.stream.id.topic: content.stream for content in contents}
 

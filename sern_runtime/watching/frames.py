@@ -21,7 +21,7 @@ MAX_EVENTS: Final = 20
 REASONS: Final = 5
 """Reasons of drops that are told of a topic."""
 STATES: Final = ("silent", "away", "connected", "unknown", "forgotten", "never")
-"""Of clients, in the order in which they are told."""
+"""States of clients, in the order in which they are told."""
 Json = dict[str, Any]
 
 

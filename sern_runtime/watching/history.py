@@ -118,7 +118,7 @@ class LinkHistory:
                 del self._tracks[peer]
 
     def since(self, number: int) -> Iterator[tuple[str, list[Point]]]:
-        """Of each link the points of steps after `number` that are over, oldest first."""
+        """The points of each link, of steps after `number` that are over, oldest first."""
         for peer, track in list(self._tracks.items()):
             points = [point for point in track.points if number < point.number <= self.number]
             if number < track.number <= self.number:  # nothing has ended it: the link is not noted any more

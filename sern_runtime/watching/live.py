@@ -23,9 +23,9 @@ from sern_runtime.watching.why import Comparison
 
 INTERVAL_S: Final = 1.0
 FIRST_S: Final = 0.4
-"""Between the first two looks: before the second there are no rates, and nothing is shown."""
+"""Time between the first two looks: before the second there are no rates, and nothing is shown."""
 WINDOW_S: Final = 3.2
-"""Rates are of so long."""
+"""The time over which rates are taken."""
 MAX_WATCHERS: Final = 8
 SLICE: Final = 50
 """Rows that are read or judged in one turn of the loop: some 5 ms."""
@@ -95,7 +95,7 @@ class Live:
         self._wake()
 
     def reset(self) -> None:
-        """After a failure: begin anew."""
+        """Begin anew, after a failure."""
         self._samples.clear()
         self.frame = ""
 

@@ -219,7 +219,7 @@ def sample(
     adaptation: Json | None,
     events: Sequence[Json],
 ) -> Sample:
-    """Of parts that were read one by one; `head` is /api/clients without its rows."""
+    """A sample of parts that were read one by one; `head` is /api/clients without its rows."""
     return Sample(
         at_s,
         head["time"],

@@ -43,9 +43,9 @@ ON_ARRIVAL: Final = frozenset({
 STILL_S: Final = 3.0
 """A topic of which nothing came for so long is worth a word, unless it is latched."""
 DENIED: Final = 3
+"""Refusals of the access rules that a relay is asked about."""
 SET_SHOWN: Final = 5
 """Topics that are shown with what is set of them by hand."""
-"""Refusals of the access rules that a relay is asked about."""
 MUCH: Final = 0.1
 """A share of what is offered whose loss is worth a word."""
 NO_LINK: Final = "there is no link to the relay"

@@ -39,7 +39,7 @@ class Field:
         self.site = site
         self.robot = robot
         self.recordings: list[Path] = [lab.directory / "site.bag"]
-        """Where the site has recorded, in their order."""
+        """The site's recordings, in their order."""
         self.sessions: dict[str, int] = {"robot1": 1, "site": 1}
         """How often each client has come to the relay by the end."""
 

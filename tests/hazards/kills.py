@@ -19,7 +19,7 @@ from tests.hazards.field import write_numbers
 
 RULES: Final[list[dict[str, Any]]] = [{"match": "/chat", "class": "state", "durable": True}]
 MESSAGES: Final = 400
-"""Of each run of the robot: more than it gets to in its life."""
+"""Messages of each run of the robot: more than it gets to in its life."""
 LONGEST_S: Final = 1.0
 WHEN_IT_STORES: Final = 0.7
 """This share of the kills comes after the robot has begun to store; the others come at any moment from its start on."""

@@ -56,3 +56,4 @@ async def test_broken_key_file_at_reload(tmp_path: Path) -> None:
         (world.lab.clients_dir / "robot2.pub").write_text("nonsense")
         world.relay.signal(signal.SIGHUP)
         await world.relay.said("reload failed, the old configuration stays", "robot2.pub")
+        assert metric(world.relay, "sern_relay_reload_failed") == 1

@@ -98,6 +98,7 @@ async def test_other_protocols(tmp_path: Path, open_files: ExitStack, kind: str)
             ),
             "counts it",
         )
+        assert "Traceback" not in world.relay.text
 
 
 def closed(sock: socketlib.socket) -> bool:
@@ -133,6 +134,7 @@ async def test_2000_half_open_connections(tmp_path: Path, open_files: ExitStack)
         await world.relay.until(lambda: descriptors(world.relay) <= before + 270, "keeps no more than 256 of them")
         robot2 = world.lab.process(world.lab.client_file("robot2", {"kind": "synthetic", "role": "robot", "topics": 1}))
         await robot2.said("connected to relay")
+        assert descriptors(world.relay) <= before + 280, "the robot has some as well"
         await robot2.stop()
 
 

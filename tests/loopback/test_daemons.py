@@ -1,11 +1,8 @@
 """Recordings through a relay and its clients as their user runs them: byte for byte, in order, everything counted."""
 
 import json
-import os
 import signal
-import socket
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
@@ -14,6 +11,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
 from tests.daemons import START_NS, Lab, balance, bodies, delivered, recording, rss_bytes, under, write_bag
+from tests.notified import notified
 from tests.support import until
 
 HUSKY, JACKAL = "husky_gps_imu_odom.bag", "jackal_imu_odom.bag"
@@ -182,37 +180,18 @@ async def test_memory_does_not_grow_with_what_passed_through(tmp_path: Path) -> 
 
 async def test_the_relay_tells_systemd_what_it_does(tmp_path: Path) -> None:
     """Ready, reloading and stopping, over a socket as systemd makes it."""
-    with (
-        TemporaryDirectory(prefix="sern-", dir="/tmp") as short,  # a socket's path has at most 107 bytes
-        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify,
-    ):
-        path = Path(short) / "notify"
-        notify.bind(str(path))
-        notify.setblocking(False)
-        told: list[str] = []
-
-        def says(word: str) -> bool:
-            try:
-                while True:
-                    told.append(notify.recv(4096).decode())
-            except BlockingIOError:
-                return any(word in text for text in told)
-
+    with notified() as systemd:
         async with Lab(tmp_path, "robot1") as lab:
             config = lab.relay_file()
-            os.environ["NOTIFY_SOCKET"] = str(path)
-            try:
-                relay = lab.process(config)
-            finally:
-                del os.environ["NOTIFY_SOCKET"]
-            await until(lambda: says("READY=1"))
+            relay = systemd.process(lab, config)
+            await until(lambda: systemd.says("READY=1"))
             relay.signal(signal.SIGHUP)
-            await until(lambda: says("RELOADING=1") and says("STATUS=0 clients, 0 streams"))
+            await until(lambda: systemd.says("RELOADING=1") and systemd.says("STATUS=0 clients, 0 streams"))
             config.write_text(json.dumps({"relay": 1}))
             relay.signal(signal.SIGHUP)
-            await until(lambda: says("; reload failed, the old configuration stays: "))
+            await until(lambda: systemd.says("; reload failed, the old configuration stays: "))
             await relay.stop()
-            assert says("STOPPING=1")
+            assert systemd.says("STOPPING=1")
 
 
 async def test_a_topic_that_goes_both_ways_is_counted_both_ways(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-import os
 import signal
 import stat
 from collections.abc import Iterator
@@ -17,6 +16,7 @@ from sern_core.vocabulary.errors import SernError, UsageError
 from sern_runtime.local_socket import ask
 from sern_tools.commands import app
 from tests.daemons import Lab, Process, bodies
+from tests.notified import notified
 from tests.support import until
 
 SCAN: Final = {"match": "/(.+/)?scan", "class": "state", "direction": "send"}
@@ -187,42 +187,19 @@ async def test_a_site_subscribes_otherwise_after_a_reload(tmp_path: Path, socket
 
 
 async def test_systemd_is_told_of_a_reload_of_a_client(tmp_path: Path, socket_path: Path) -> None:
-    told = await notified(tmp_path, socket_path)
+    with notified() as systemd:
+        async with Lab(tmp_path, "robot1") as lab:
+            config = robot_file(lab, socket_path, [COUNTER])
+            robot = systemd.process(lab, config)
+            await until(lambda: systemd.says("READY=1"))
+            config.write_text(json.dumps({"client": 1}))
+            robot.signal(signal.SIGHUP)
+            await until(lambda: systemd.says("; reload failed, the old configuration stays: "))
+            await robot.stop()
+    told = systemd.told
     begins = next(at for at, text in enumerate(told) if text.startswith("RELOADING=1\nMONOTONIC_USEC="))
     ends = next(at for at, text in enumerate(told) if at > begins and text.startswith("READY=1"))
     assert "STATUS=link " in told[ends]
-
-
-async def notified(tmp_path: Path, socket_path: Path) -> list[str]:
-    """What a client tells systemd from its start to a reload that fails."""
-    import socket
-
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
-        path = socket_path.parent / "notify"
-        notify.bind(str(path))
-        notify.setblocking(False)
-        told: list[str] = []
-
-        def says(word: str) -> bool:
-            try:
-                while True:
-                    told.append(notify.recv(4096).decode())
-            except BlockingIOError:
-                return any(word in text for text in told)
-
-        async with Lab(tmp_path, "robot1") as lab:
-            config = robot_file(lab, socket_path, [COUNTER])
-            os.environ["NOTIFY_SOCKET"] = str(path)
-            try:
-                robot = lab.process(config)
-            finally:
-                del os.environ["NOTIFY_SOCKET"]
-            await until(lambda: says("READY=1"))
-            config.write_text(json.dumps({"client": 1}))
-            robot.signal(signal.SIGHUP)
-            await until(lambda: says("; reload failed, the old configuration stays: "))
-            await robot.stop()
-        return told
 
 
 async def test_who_may_not_is_told_so(socket_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

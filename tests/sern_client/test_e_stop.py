@@ -1,10 +1,12 @@
 """Emergency stops: what latches one, what it stops, what survives, and what releases it."""
 
+import errno
 import logging
 from pathlib import Path
 
 import pytest
 
+from sern_client import e_stop
 from sern_client.e_stop import EStop, EStops, says_stop
 from sern_core.topics.patterns import PatternSet
 from sern_core.vocabulary.errors import ConfigError, UsageError
@@ -82,10 +84,20 @@ def test_where_it_cannot_be_kept_the_client_does_not_start(tmp_path: Path) -> No
         Robot(tmp_path / "missing" / "state")
 
 
-def test_a_full_disk_ends_no_stop(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_full_disk_ends_no_stop(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The robot stands before the disk is asked."""
     caplog.set_level(logging.INFO)
     robot = Robot(tmp_path / "state")
-    (tmp_path / "state.new").mkdir()  # what is written there fails
+    halted: list[int] = []
+
+    def full(_path: Path, _text: str) -> None:
+        halted.append(robot.halted)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(e_stop, "write_whole", full)
     robot.hears(on=True)
+    assert halted == [1]
     assert robot.stops.stopped(DRIVE) == STOP and robot.halted == 1
     assert "could not be kept" in caplog.text

@@ -49,7 +49,7 @@ class SceneTypes:
             return False
 
     def service_definition(self, type_name: str, encoding: Encoding) -> str | None:
-        """As `KnowsServiceTypes` has it."""
+        """See `KnowsServiceTypes`."""
         return self._files.service(type_name, encoding)
 
     def service(self, type_name: str) -> TypeText:

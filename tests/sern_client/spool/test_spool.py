@@ -9,14 +9,16 @@ import pytest
 from sern_client.endpoints.record import RecordEndpoint, RecordOptions
 from sern_client.site import Site
 from sern_client.spool import ledger
+from sern_client.spool import spool as spool_module
 from sern_client.spool.spool import Spool
 from sern_core.topics.rules import RuleSet
 from sern_core.topics.spool_names import kept_name, parse
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo, TopicSpec
-from sern_core.vocabulary.types import ClientName, Encoding, TopicName
+from sern_core.vocabulary.types import ClientName, DropReason, Encoding, TopicName
 from sern_runtime.config.spool import SpoolSection
 from sern_runtime.spool.store import Store
+from tests.sern_client.test_keeping import FakeKeeper
 from tests.world import World
 
 TOPIC = TopicName("/robot1/points")
@@ -66,6 +68,25 @@ async def test_a_disk_that_is_full_at_the_start_is_one_line_and_costs_only_the_f
     assert json.loads(json.dumps(made.to_json()))["problem"] == made.problem
     await made.close()
     assert not (tmp_path / "filled").exists()
+
+
+async def test_what_the_recording_lost_is_not_known_as_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recording says at once that it has no room for a message, long before it says up to where it is flushed."""
+    recording = FakeKeeper()
+    monkeypatch.setattr(spool_module, "keepers_of", lambda _endpoint: [recording])
+    made = spool(tmp_path)
+    made.start()
+    assert made.fetching is not None
+    live = StreamId(ClientName("robot1"), 5, TOPIC)
+    for seq in (1, 2):
+        mark = made.fetching.mark(live)
+        assert mark is not None
+        recording.taken += 1
+        made.fetching.published(live, seq, mark)
+    recording.told(0, {1: DropReason.STORAGE})
+    recording.told(2, {})
+    await made.close()
+    assert ledger.load(tmp_path / "filled") == {TOPIC: {5: ((2, 2),)}}
 
 
 async def test_only_what_the_file_names_is_taken(tmp_path: Path) -> None:

@@ -157,7 +157,7 @@ async def test_a_stream_that_is_forgotten_frees_its_room(tmp_path: Path) -> None
 
 
 async def test_an_origin_leaves_as_much_free_as_it_has(tmp_path: Path) -> None:
-    """So that one which fills its share, and more than one, leave room for those that come later."""
+    """One that fills its share, and several, leave room for those that come later."""
     size = 1000 - ROW_BYTES
     keeper = make(Store(tmp_path), [], max_bytes=12_000, shared=True)
     keeper.start()
