@@ -20,6 +20,7 @@ PATHS: Final = {
     "4 Mbit/s 50 ms": ThinPath(4e6, 0.025),
 }
 TOPICS: Final = {"pose": POSE, "command": COMMAND, "cloud": CLOUD}
+LIVE: Final = {"poses, commands": False, "poses, commands, clouds": True}
 IDLE_SHARE: Final = 0.8
 
 
@@ -41,20 +42,17 @@ def figures(run: Played) -> dict[str, float]:
 def bench(options: argparse.Namespace, report: Report) -> None:
     paths = dict(list(PATHS.items())[1:2]) if options.quick else PATHS
     for case, path in paths.items():
-        alone, beside = play(path, fetch=False), play(path, fetch=True)
-        share = idle_share(alone, beside)
-        report.row(case, "live alone", **figures(alone))
-        report.row(case, "beside a fetch", **figures(beside), idle_share_percent=100 * share)
-        for name in ("pose", "command"):
-            added_ms = figures(beside)[f"{name}_p99_ms"] - figures(alone)[f"{name}_p99_ms"]
-            report.reach(f"{case}: p99 of a {name}, added [ms]", added_ms, 1e3 * path.datagram_s)
-        report.reach(f"{case}: share of the free link that a fetch uses", share, IDLE_SHARE, at_least=True)
-        quiet, fetching = play(path, fetch=False, clouds=False), play(path, fetch=True, clouds=False)
-        report.row(case, "pose and commands alone", **figures(quiet))
-        share = idle_share(quiet, fetching)
-        report.row(case, "the same beside a fetch", **figures(fetching), idle_share_percent=100 * share)
+        for live, clouds in LIVE.items():
+            alone, beside = (play(path, fetch=fetch, clouds=clouds) for fetch in (False, True))
+            share = idle_share(alone, beside)
+            report.row(case, f"{live} alone", **figures(alone))
+            report.row(case, f"{live} beside a fetch", **figures(beside), idle_share_percent=100 * share)
+            for name in ("pose", "command"):
+                added_ms = figures(beside)[f"{name}_p99_ms"] - figures(alone)[f"{name}_p99_ms"]
+                report.reach(f"{case}, {live}: p99 of a {name}, added [ms]", added_ms, 1e3 * path.datagram_s)
+            report.reach(f"{case}, {live}: share of the free link for a fetch", share, IDLE_SHARE, at_least=True)
     report.note("virtual time; 60 s; what may be added is one full datagram's time on the link")
-    report.note("without clouds a pose meets an empty link, and one that is as full as clouds fill it beside a fetch")
+    report.note("without clouds a pose alone meets an empty link")
 
 
 if __name__ == "__main__":

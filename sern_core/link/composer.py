@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Final
 
+from sern_core.link.background import Background
 from sern_core.link.control_stream import ControlStream
 from sern_core.link.datagram import MIN_SHARE_BYTES, Datagram
 from sern_core.link.end import End
@@ -46,6 +47,7 @@ class Composer:
         self._taking = taking
         self._control_sent = control_sent
         self._outlook = Outlook(now)
+        self.background = Background()
         self.served: OutChannel | None = None
         """What left last, while decisions are traced; control messages aside."""
 
@@ -65,6 +67,8 @@ class Composer:
         pends = scheduler.pends
         if not window_open and pends:
             self._outlook.full(now)
+            if scheduler.pending(PriorityClass.STATE) or scheduler.pending(PriorityClass.BULK):
+                self.background.live_waits(now)
         # Behind a window that is shut class control alone may leave.
         waits = pends or control.waits if window_open else scheduler.pending(PriorityClass.CONTROL)
         if not (waits or self._taking.watermarks or sender.paper):
@@ -94,7 +98,7 @@ class Composer:
                     scheduler.charge(PriorityClass.CONTROL, grown, now=now)
                     break
                 continue
-            if channel is None:
+            if channel is None or (channel.spec.background and not self.background.room(lane, now)):
                 break
             out = channel.head(now)
             if out is None:
@@ -109,6 +113,8 @@ class Composer:
             priority = class_of(channel, out)
             if served is None and priority is not PriorityClass.CONTROL:
                 limit = self._cut(lane, limit, now)
+            if served is None and channel.spec.background:
+                limit = min(limit, self.background.limit(lane, now))
             shared = said is not None and priority is PriorityClass.CONTROL
             end = limit - framing.DATA_FIRST_BYTES - RIDE_BYTES if shared else limit
             if datagram.frames and (
@@ -133,6 +139,15 @@ class Composer:
         if served is PriorityClass.CONTROL or (served is PriorityClass.BULK and not spoke):
             lane.priority = served
         return window_open
+
+    def waits(self, lane: Lane, now: float) -> bool:
+        """Whether something would leave if window and pacer let it. What the background holds back by itself does not:
+        the link was not full then. Unless a queue stays: then it is, and slower than it was."""
+        chosen = self._sender.scheduler.pick(now=now, window_open=True)
+        if chosen is None or self._control.waits:
+            return self._control.waits
+        in_background = self._sender.channels[chosen].spec.background
+        return not in_background or lane.estimator.queues or self.background.room(lane, now)
 
     def pick(self, now: float, *, window_open: bool) -> int | None:
         """The channel that the lane with the data would serve next; class control goes over the priority lane, if there

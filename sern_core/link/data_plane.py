@@ -51,7 +51,7 @@ class DataPlane:
         self._answers = answers
         self._composer = composer
         self._housekeeping = housekeeping
-        self.holds = Holds(end, lanes, control, sender)
+        self.holds = Holds(end, lanes, control, sender, composer.background)
         """Why what waits does."""
         self.on_arrived: Callable[[TopicSpec, Message, float], None] | None = None
         """Called when the peer has a message whole: what holds for its topic, the message, now."""
@@ -123,9 +123,7 @@ class DataPlane:
         estimator = lane.estimator
         inflight_bytes = nbytes + (flight.inflight_bytes if lane.beside is None else lane.under_way_bytes)
         # What could be picked if window and pacer let it is held back by them; ordering `paper` holds back by itself.
-        waits = (lane is lanes.lane or lane is lanes.priority_lane) and bool(
-            self._control.waits or scheduler.pick(now=now, window_open=True) is not None
-        )
+        waits = (lane is lanes.lane or lane is lanes.priority_lane) and self._composer.waits(lane, now)
         path = lane.path
         app_limited = not waits and not path.held and inflight_bytes < estimator.window_bytes
         path.held = False

@@ -7,6 +7,7 @@ over which much waits is looked at again soon, and what that costs does not grow
 from math import inf
 from typing import Any, Final
 
+from sern_core.link.background import Background
 from sern_core.link.control_stream import ControlStream
 from sern_core.link.end import End
 from sern_core.link.lane_set import LaneSet
@@ -38,11 +39,14 @@ _REASONS: Final = {
 class Holds:
     """One link's. `due_s` is when it may be asked to `look` again."""
 
-    def __init__(self, end: End, lanes: LaneSet, control: ControlStream, sender: Sender) -> None:
+    def __init__(
+        self, end: End, lanes: LaneSet, control: ControlStream, sender: Sender, background: Background
+    ) -> None:
         self._end = end
         self._lanes = lanes
         self._control = control
         self._sender = sender
+        self._background = background
         self._turn = 0
         self.due_s = -inf if end.trace.enabled else inf
         self.served: OutChannel | None = None
@@ -88,6 +92,8 @@ class Holds:
             return _REASONS[wait], self._before(chosen)
         if self._control.waits and channel.spec.priority is not PriorityClass.CONTROL:
             return HoldReason.CONTROL, {}
+        if not closed and channel.spec.background and not self._background.room(lane, now):
+            return HoldReason.WINDOW, {"inflight_bytes": lane.under_way_bytes}
         if not closed:
             return None
         if served is not None and served.spec.priority is channel.spec.priority:

@@ -84,6 +84,11 @@ class CapacityEstimator(ABC):
         """Round-trip time of the empty path; None while unknown."""
 
     @property
+    def unqueued_bytes(self) -> float:
+        """Bytes in flight that fill the path and wait nowhere on it; what is in the background keeps below."""
+        return self.window_bytes
+
+    @property
     def eased_s(self) -> float:
         """When packets were last seen to take clearly less time than the link as it is known can have given them: it
         may have got faster, though there was too little to send to tell by how much. -inf: never."""

@@ -45,6 +45,7 @@ from sern_core.path.congestion.path_model import PathModel, Seen
 from sern_core.path.congestion.sooner import Sooner
 from sern_core.path.congestion.start_up import StartUp
 from sern_core.path.congestion.swings import Swings
+from sern_core.path.congestion.unqueued import Unqueued
 
 SOONER_ROOM: Final = 4
 """Packets."""
@@ -81,6 +82,7 @@ class HybridWindow(CapacityEstimator):
         contention = self._contention = Contention(params, path, self._losses)
         self._rival, self._drain = contention.rival, contention.drain
         self._sooner = Sooner(params)
+        self._unqueued = Unqueued()
         self._swings = Swings(params, path, contention.drain)
         self._resumed_s = -inf  # when the first acknowledgement after a silence came
         self._restart()
@@ -124,6 +126,14 @@ class HybridWindow(CapacityEstimator):
     @property
     def queues(self) -> bool:
         return self._view.queue_s > self._view.high_s
+
+    @property
+    def unqueued_bytes(self) -> float:
+        """As much as the window while that finds out what the link carries, or shares it with somebody else."""
+        rtt_s, rate = self._path.rtt_s, self._rate.value
+        if self._mode is not STEADY or rate is None or rtt_s is None or not self._rate.saturated:
+            return self.window_bytes
+        return min(self.window_bytes, rate * rtt_s + self._unqueued.fragments * self._path.fragment)
 
     @property
     def eased_s(self) -> float:
@@ -348,6 +358,7 @@ class HybridWindow(CapacityEstimator):
                 self._happens(Event.SETTLED)
         elif seen.limited:
             self._steer(now, seen, lost, interval_s)
+        self._unqueued.close_epoch(self._view)
         self._pace.set(self._mode, self._window)
         self._path.begin_epoch(now)
         losses.next_epoch()

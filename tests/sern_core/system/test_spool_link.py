@@ -9,10 +9,19 @@ def p99(found_s: list[float]) -> float:
     return found_s[int(0.99 * len(found_s))]
 
 
-@pytest.mark.parametrize("loss", [0.0, 0.01])
-def test_a_fetch_takes_what_is_free_of_a_thin_link_and_nothing_else(loss: float) -> None:
-    path = ThinPath(1e6, 0.05, loss=loss)
-    alone, beside = play(path, fetch=False), play(path, fetch=True)
+@pytest.mark.parametrize(
+    ("path", "clouds"),
+    [
+        (ThinPath(1e6, 0.05), True),
+        (ThinPath(1e6, 0.05, loss=0.01), True),
+        (ThinPath(256e3, 0.1), False),
+        (ThinPath(1e6, 0.05), False),
+        (ThinPath(4e6, 0.025), False),
+    ],
+)
+def test_a_fetch_takes_what_is_free_of_a_thin_link_and_nothing_else(path: ThinPath, clouds: bool) -> None:
+    """Also where nothing live fills the link: a pose meets an empty one then, but for one datagram of the fetch."""
+    alone, beside = play(path, fetch=False, clouds=clouds), play(path, fetch=True, clouds=clouds)
     for topic in (POSE, COMMAND):
         assert p99(beside.ages_s(topic)) <= p99(alone.ages_s(topic)) + path.datagram_s
         assert len(beside.ages_s(topic)) >= 0.99 * len(alone.ages_s(topic))
