@@ -73,6 +73,7 @@ class ClientViews:
             # Nobody misses a request that nobody makes.
             "subscribed": [text for text in self._core.subscription.patterns if not self._bridge.asking.takes(text)],
             "by_hand": self._by_hand(),
+            "spool": {} if self._bridge.spool is None else self._bridge.spool.in_brief(),
             "stays_here": list(outbound.unnamed)[:MAX_TOLD],
             "now_s": now,
         }

@@ -208,5 +208,7 @@ def spool_merge(
         raise typer.Exit(say("sern spool merge", error)) from None
     for path in done.cut_off or ():
         typer.echo(f"sern spool merge: {path} was cut off; what is whole of it is there", err=True)
+    if done.damaged:
+        typer.echo(f"sern spool merge: damaged on the disk and left out: {done.damaged:,}", err=True)
     twice = f", {done.twice:,} that were there twice are left out" if done.twice else ""
     typer.echo(f"{out}: {done.messages:,} messages{twice}")

@@ -14,8 +14,6 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from mcap.records import Message as McapMessage
-from mcap.stream_reader import StreamReader
 from rosbags.interfaces import Connection, ConnectionExtRosbag1, ConnectionExtRosbag2, QosDurability
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag1 import ReaderError as ReaderError1
@@ -27,7 +25,7 @@ from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_types
-from sern_runtime.spool.files import MAX_RECORD_BYTES, UNREADABLE, KeptStream, messages_of
+from sern_runtime.spool.files import UNREADABLE, KeptStream, message_at, messages_of
 
 SUFFIXES: Final = {".bag": Encoding.ROS1, ".mcap": Encoding.CDR}
 WORDS: Final = {Encoding.ROS1: "ROS 1", Encoding.CDR: "ROS 2"}
@@ -61,6 +59,8 @@ class Merged:
     twice: int = 0
     cut_off: list[Path] | None = None
     """Inputs that are not whole; what is whole of them is there."""
+    damaged: int = 0
+    """Kept messages that are not what was written; they are left out."""
 
 
 def merge(inputs: Sequence[Path], out: Path, selection: Selection) -> Merged:
@@ -201,7 +201,9 @@ def _of_spool(path: Path, selection: Selection, done: Merged) -> Iterator[Found]
             try:
                 for found in messages_of(file):
                     stamp_ns = found.message.log_time
-                    if selection.takes(found.stream.info.name, stamp_ns):
+                    if not found.whole:
+                        done.damaged += 1
+                    elif selection.takes(found.stream.info.name, stamp_ns):
                         stream = streams.setdefault(found.stream.key, found.stream)
                         places.append(_Place(stamp_ns, found.offset, stream))
             except KeyError:
@@ -221,9 +223,8 @@ def _bodies(path: Path, places: Sequence[_Place]) -> Iterator[Found]:
     try:
         with path.open("rb") as file:
             for stamp_ns, offset, stream in places:
-                file.seek(offset)
-                record = next(iter(StreamReader(file, skip_magic=True, record_size_limit=MAX_RECORD_BYTES).records))
-                if not isinstance(record, McapMessage):
+                record = message_at(file, offset)
+                if record is None:
                     raise ConfigError("has changed while it was read; try again", file=str(path))
                 yield Found(stamp_ns, stream.info, record.data)
     except OSError as error:

@@ -125,6 +125,18 @@ class Spool:
         problems = (keeper.problem for keeper in (self.keeper, self.filler) if keeper is not None)
         return next(filter(None, problems), None)
 
+    def in_brief(self) -> dict[str, object]:
+        """What `/api/link` says of it: what is wrong, what a robot has kept, what a site still lacks, by topic."""
+        keeper, fetching = self.keeper, self.fetching
+        spans = [] if keeper is None else [span for each in keeper.topics.values() for span in each]
+        lacking = {} if fetching is None else fetching.missing()
+        return {
+            "problem": self.problem,
+            "kept_messages": sum(span.messages for span in spans),
+            "kept_bytes": 0 if keeper is None else keeper.store.kept_bytes,
+            "missing": {topic: missing.messages for topic, missing in lacking.items() if missing.messages},
+        }
+
     def to_json(self) -> dict[str, object]:
         """What `/api/spool` says."""
         keeper, filler = self.keeper, self.filler

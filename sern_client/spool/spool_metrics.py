@@ -52,8 +52,8 @@ def register_spool(metrics: Metrics, spool: Spool | None) -> None:
     )
     metrics.counter(
         "sern_spool_damaged_total",
-        "Files of the spool that could not be read, or not to their end.",
-        read=lambda: [((), float(sum(0 if each is None else each.store.damaged_files for _what, each in both)))],
+        "Files of the spool that could not be read, or not to their end, and messages that were not as written.",
+        read=lambda: [((), float(sum(0 if each is None else each.store.damaged for _what, each in both)))],
     )
     metrics.counter(
         "sern_spool_sent_total",

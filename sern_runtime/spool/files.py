@@ -1,13 +1,16 @@
 """One file of kept messages: MCAP without chunks, so that what was flushed is whole whatever happens then.
 
 A channel is a topic of one process of its origin, with who that is in its metadata; `sequence` of a message is the low
-half of its seq, `log_time` and `publish_time` are the stamp with which the endpoint took it. A finished file ends with
-an index of ours as metadata. One that was cut off (power, kill -9, a full disk) is read to where it is whole.
+half of its seq, `log_time` and `publish_time` are the stamp with which the endpoint took it. Each message is followed
+by a record of ours with its CRC-32, which other readers of MCAP skip: without chunks the format has no checksum. A
+finished file ends with an index of ours as metadata. One that was cut off (power, kill -9, a full disk) is read to
+where it is whole.
 """
 
 import json
 import os
 import struct
+import zlib
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -33,7 +36,13 @@ MARK_BYTES: Final = 128 * 2**10
 """How far apart the places are of which the index knows which message is there."""
 MAX_STAMP_NS: Final = 2**63 - 1
 MAX_RECORD_BYTES: Final = 2**30
-RECORD_BYTES: Final = 31
+CHECK: Final = struct.Struct("<BQI")
+"""The record behind a message: opcode, length of what follows, CRC-32 of channel, sequence, stamp and body."""
+CHECK_OPCODE: Final = 0x80
+"""MCAP keeps the opcodes from here on for records of applications."""
+CHECK_LENGTH: Final = CHECK.size - 9
+CHECKED: Final = struct.Struct("<HIQ")
+RECORD_BYTES: Final = 31 + CHECK.size
 """What a message takes in the file beside its body."""
 _SCHEMAS: Final = {Encoding.ROS1: ("ros1", "ros1msg"), Encoding.CDR: ("cdr", "ros2msg")}
 _ENCODINGS: Final = {words[0]: encoding for encoding, words in _SCHEMAS.items()}
@@ -111,6 +120,10 @@ class FileIndex:
         return json.dumps({str(number): _row(content) for number, content in self.contents.items()})
 
 
+def _crc(channel: int, sequence: int, stamp_ns: int, body: bytes) -> int:
+    return zlib.crc32(body, zlib.crc32(CHECKED.pack(channel, sequence, stamp_ns)))
+
+
 def _row(content: Content) -> list[object]:
     return [
         content.first, content.last, content.first_ns, content.last_ns, content.messages, content.nbytes, content.marks,
@@ -150,7 +163,9 @@ class GrowingFile:
         channel = self._channel(kept.stream, kept.seq >> 32)
         offset = self._file.tell()
         stamp_ns = min(max(kept.stamp_ns, 0), MAX_STAMP_NS)
-        self._writer.add_message(channel, stamp_ns, kept.body, stamp_ns, kept.seq & 0xFFFFFFFF)
+        sequence = kept.seq & 0xFFFFFFFF
+        self._writer.add_message(channel, stamp_ns, kept.body, stamp_ns, sequence)
+        self._file.write(CHECK.pack(CHECK_OPCODE, CHECK_LENGTH, _crc(channel, sequence, stamp_ns, kept.body)))
         self._new.append((channel, kept, offset))
         self.messages += 1
 
@@ -251,7 +266,9 @@ def _from_metadata(file: IO[bytes], index: FileIndex) -> bool:
 
 def _from_messages(file: IO[bytes], index: FileIndex) -> None:
     contents = index.contents
-    for seq, message, stream, offset in messages_of(file):
+    for seq, message, stream, offset, whole in messages_of(file):
+        if not whole:
+            continue
         content = contents.get(message.channel_id)
         if content is None:
             stamp_ns = message.log_time
@@ -274,36 +291,58 @@ def stream_of(channel: Channel, schema: Schema) -> KeptStream:
     return KeptStream(StreamId(ClientName(about["origin"]), int(about["boot"]), TopicName(channel.topic)), info)
 
 
-def _records(file: IO[bytes], *, skip_magic: bool) -> Iterator[tuple[McapRecord, int]]:
-    """The records from here on, each with where it begins. Ends at the footer or the end of the file; raises one of
-    UNREADABLE for what is none."""
+def _records(file: IO[bytes], *, skip_magic: bool) -> Iterator[tuple[McapRecord, int, bool]]:
+    """The records from here on, each with where it begins, and whether a message is as it was written. Ends at the
+    footer or the end of the file; raises one of UNREADABLE for what is none."""
     offset = file.tell() + (0 if skip_magic else 8)
     for record in StreamReader(file, skip_magic=skip_magic, record_size_limit=MAX_RECORD_BYTES).records:
-        yield record, offset
+        yield record, offset, not isinstance(record, McapMessage) or _as_written(file, record)
         offset = file.tell()
 
 
+def _as_written(file: IO[bytes], message: McapMessage) -> bool:
+    """Read the record behind a message. ValueError where there is none: the message itself may not be what it seems."""
+    found = file.read(CHECK.size)
+    if len(found) < CHECK.size:
+        raise ValueError("it is cut off")
+    opcode, length, crc = CHECK.unpack(found)
+    if (opcode, length) != (CHECK_OPCODE, CHECK_LENGTH):
+        raise ValueError(f"no checksum follows the message before {file.tell() - CHECK.size}")
+    return bool(crc == _crc(message.channel_id, message.sequence, message.log_time, message.data))
+
+
 class FoundMessage(NamedTuple):
-    """A message of a file; it stands at `offset`."""
+    """A message of a file; it stands at `offset`. `whole`: as it was written."""
 
     seq: int
     message: McapMessage
     stream: KeptStream
     offset: int
+    whole: bool
 
 
 def messages_of(file: IO[bytes]) -> Iterator[FoundMessage]:
     """All messages of a file, from its beginning. Raises one of UNREADABLE where it is not whole."""
     schemas: dict[int, Schema] = {}
     streams: dict[int, tuple[KeptStream, int]] = {}
-    for record, offset in _records(file, skip_magic=False):
+    for record, offset, whole in _records(file, skip_magic=False):
         if isinstance(record, Schema):
             schemas[record.id] = record
         elif isinstance(record, Channel):
             streams[record.id] = stream_of(record, schemas[record.schema_id]), int(record.metadata["high"]) << 32
         elif isinstance(record, McapMessage):
             stream, high = streams[record.channel_id]
-            yield FoundMessage(high | record.sequence, record, stream, offset)
+            yield FoundMessage(high | record.sequence, record, stream, offset, whole)
+
+
+def message_at(file: IO[bytes], offset: int) -> McapMessage | None:
+    """The message at an offset that `messages_of` has named; None: it is not there any more. Raises OSError."""
+    file.seek(offset)
+    try:
+        record, _offset, whole = next(_records(file, skip_magic=True))
+    except (StopIteration, *UNREADABLE):
+        return None
+    return record if isinstance(record, McapMessage) and whole else None
 
 
 def read_runs(index: FileIndex, channel: int, runs: Sequence[Run]) -> Iterator[FoundMessage]:
@@ -320,13 +359,13 @@ def read_runs(index: FileIndex, channel: int, runs: Sequence[Run]) -> Iterator[F
             offset = content.offset(first)
             if file.tell() <= offset or file.tell() == 0:
                 file.seek(offset)
-            for record, at in _records(file, skip_magic=True):
+            for record, at, whole in _records(file, skip_magic=True):
                 if at >= index.size_bytes:
                     break
                 if not isinstance(record, McapMessage) or record.channel_id != channel:
                     continue
                 seq = high | record.sequence
                 if seq >= first and seq <= last:
-                    yield FoundMessage(seq, record, content.stream, at)
+                    yield FoundMessage(seq, record, content.stream, at, whole)
                 if seq >= last:
                     break

@@ -58,6 +58,8 @@ class Store:
         self.deleted_files = 0
         self.deleted_messages = 0
         self.damaged_files = 0
+        self.damaged_messages = 0
+        self._said_damaged: set[Path] = set()
         """Files that are not whole, other than at their end."""
         self._prefix = prefix
         self._keeps_all = keeps_all
@@ -191,6 +193,11 @@ class Store:
         growing_bytes = 0 if self._growing is None else self._growing.index.size_bytes
         self.kept_bytes = self._closed_bytes + growing_bytes
 
+    @property
+    def damaged(self) -> int:
+        """Files and messages that could not be read as they were written."""
+        return self.damaged_files + self.damaged_messages
+
     # --- reading ----------------------------------------------------------------------------------------------------
 
     def _indexes(self) -> list[FileIndex]:
@@ -227,6 +234,9 @@ class Store:
                     continue
                 try:
                     for found in read_runs(index, channel, runs):
+                        if not found.whole:
+                            self._damaged(index, found.seq)
+                            continue
                         message = found.message
                         if not from_ns <= message.log_time <= to_ns:
                             continue
@@ -246,6 +256,13 @@ class Store:
                     self._drop(index)
                     break
         return Answer(tuple(messages), ())
+
+    def _damaged(self, index: FileIndex, seq: int) -> None:
+        """A message is not what was written: whoever asks for it is told that there is none."""
+        self.damaged_messages += 1
+        if index.path not in self._said_damaged:
+            self._said_damaged.add(index.path)
+            _log.error("%s: message %d is damaged; it is left out, and others that are", index.path, seq)
 
     def _drop(self, index: FileIndex) -> None:
         if index in self._closed:

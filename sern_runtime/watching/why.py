@@ -44,6 +44,8 @@ STILL_S: Final = 3.0
 """A topic of which nothing came for so long is worth a word, unless it is latched."""
 DENIED: Final = 3
 """Refusals of the access rules that a relay is asked about."""
+SPOOL_SHOWN: Final = 3
+"""Topics of which it is said that messages are missing."""
 SET_SHOWN: Final = 5
 """Topics that are shown with what is set of them by hand."""
 MUCH: Final = 0.1
@@ -144,6 +146,7 @@ class _Situation:
         self._wants: list[str] = row.get("subscribed", [])
         self._stays: list[str] = row.get("stays_here", [])
         self._set: Json = row.get("by_hand", {})
+        self._spool: Json = row.get("spool", {})
         self._summaries = {
             item["stream"].rpartition(f"/{item['kind']}")[0] or item["stream"]: item
             for item in row.get("summaries", ())
@@ -285,6 +288,7 @@ class _Situation:
             some = ", ".join(self._stays[:3]) + (", ..." if len(self._stays) > 3 else "")
             yield NOTE, f"stays here, as no rule in `topics` names it: {some}"
         yield from _by_hand(self._set)
+        yield from _of_spool(self._spool)
         names = {literal(pattern) for pattern in self._wants}
         for text in self._denied:
             if not any(name in text.replace(":", " ").split() for name in names if name):
@@ -308,6 +312,19 @@ def _by_hand(said: Json) -> Iterator[Word]:
         yield NOTE, f"set by hand: {more} more topics; `sern set` lists them"
     if said.get("profile"):
         yield NOTE, f"set by hand: profile {said['profile']}"
+
+
+def _of_spool(said: Json) -> Iterator[Word]:
+    """What a client keeps for later, or lacks of what a robot has kept."""
+    if said.get("problem"):
+        yield BAD, f"spool: {said['problem']}"
+    if said.get("kept_messages"):
+        yield NOTE, f"spool: {said['kept_messages']:,} messages are kept here, {said['kept_bytes'] / 1e6:,.1f} MB"
+    lacking = sorted(said.get("missing", {}).items(), key=lambda item: (-item[1], item[0]))
+    for topic, messages in lacking[:SPOOL_SHOWN]:
+        yield NOTE, f"spool: {messages:,} messages of {topic} are at its robot and not here yet"
+    if len(lacking) > SPOOL_SHOWN:
+        yield NOTE, f"spool: and of {len(lacking) - SPOOL_SHOWN} more topics; `sern spool ls` lists them"
 
 
 def literal(pattern: str) -> str | None:

@@ -145,6 +145,7 @@ async def test_only_what_somebody_asks_for_is_fetched_and_only_by_whom_the_rules
         await site.until(lambda: not order.exists(), "has done it")
         fetched = row(site)["fetched_messages"]
         assert row(site)["missing_messages"] == COUNT - fetched
+        assert site.json("/api/link")[0]["spool"]["missing"] == {TOPIC: COUNT - fetched}  # and so `sern top` says
         assert beside.json("/api/spool")["fetch"] == []
         await robot.stop()
         await beside.stop()

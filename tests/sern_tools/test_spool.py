@@ -154,6 +154,16 @@ def test_of_a_file_that_was_cut_off_what_is_whole_is_there(tmp_path: Path) -> No
     assert bodies(tmp_path / "whole.bag")[TOPIC] == [text(number) for number in range(1, done.messages + 1)]
 
 
+def test_a_message_that_was_damaged_on_the_disk_is_left_out_and_said(tmp_path: Path) -> None:
+    path = fetched(tmp_path / "a.mcap", list(range(10)))
+    damaged = bytearray(path.read_bytes())
+    damaged[damaged.index(text(4)) + len(text(4)) - 1] ^= 1
+    path.write_bytes(damaged)
+    done = CliRunner().invoke(app, ["spool", "merge", str(path), "--out", str(tmp_path / "whole.bag")])
+    assert done.exit_code == 0 and "damaged on the disk and left out: 1\n" in done.output
+    assert bodies(tmp_path / "whole.bag")[TOPIC] == [text(number) for number in range(10) if number != 4]
+
+
 def test_what_cannot_be_merged_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
     live = recording(tmp_path / "live.bag", [1, 2])
     (tmp_path / "bad.bag").write_bytes(b"no bag")

@@ -93,6 +93,23 @@ def test_a_file_that_was_cut_off_has_what_is_whole_of_it(tmp_path: Path) -> None
         assert index.messages >= length // 400 - 2
 
 
+def test_a_bit_that_flips_in_a_message_is_noticed(tmp_path: Path) -> None:
+    """Wherever in it: its body, its number, its stamp, its checksum; and no other message is lost."""
+    path = write(tmp_path / "a.mcap", finish=False)
+    whole = bytearray(path.read_bytes())
+    with path.open("rb") as file:
+        at = next(each.offset for each in messages_of(file) if each.seq == 900)
+    number, stamp, body, checksum = at + 9 + 2, at + 9 + 6, at + 9 + 22 + 100, at + 9 + 22 + 300 + 9
+    for place in (number, stamp, body, checksum):
+        whole[place] ^= 4
+        path.write_bytes(whole)
+        whole[place] ^= 4
+        index = read_index(path)
+        assert index.messages == COUNT * 3 // 2 - 1
+        found = list(read_runs(index, 1, ((1, COUNT),)))
+        assert [each.seq for each in found if each.whole] == [seq for seq in range(1, COUNT + 1) if seq != 900]
+
+
 def test_any_bytes_are_a_file_or_a_problem(tmp_path: Path) -> None:
     whole = bytearray(write(tmp_path / "a.mcap").read_bytes())
     random = Random(2)

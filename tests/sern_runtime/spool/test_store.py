@@ -96,6 +96,22 @@ def test_a_file_that_is_damaged_later_costs_what_is_in_it(tmp_path: Path) -> Non
     store.close()
 
 
+def test_a_message_that_is_not_as_it_was_written_costs_only_itself(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    store = opened(tmp_path)
+    fill(store, 1, 20)
+    path = next(tmp_path.glob("*.mcap"))
+    damaged = bytearray(path.read_bytes())
+    for seq in (7, 9):
+        damaged[damaged.index(seq.to_bytes(8, "big") + bytes(900)) + 500] ^= 1
+    path.write_bytes(damaged)
+    assert seqs(store, (1, 20)) == [seq for seq in range(1, 21) if seq not in (7, 9)]
+    assert (store.damaged_messages, store.damaged_files, store.damaged) == (2, 0, 2)
+    assert caplog.text.count("is damaged") == 1 and "message 7 is damaged" in caplog.text
+    store.close()
+
+
 def test_a_file_that_somebody_deletes_costs_what_is_in_it(tmp_path: Path) -> None:
     store = opened(tmp_path)
     fill(store, 1, 300)

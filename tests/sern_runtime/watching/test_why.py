@@ -199,6 +199,20 @@ def test_a_pattern_that_is_a_name_is_known_as_one(pattern: str, name: str | None
     assert literal(pattern) == name
 
 
+def test_what_a_spool_keeps_and_what_is_still_missing_is_said() -> None:
+    kept = {"problem": "", "kept_messages": 1234, "kept_bytes": 5_600_000, "missing": {}}
+    assert seen({}, {}, spool=kept).notes == ((NOTE, "spool: 1,234 messages are kept here, 5.6 MB"),)
+    lacking = {"problem": "the disk is full", "kept_messages": 0, "kept_bytes": 0}
+    lacking["missing"] = {"/a": 1, "/b": 70_000, "/c": 2, "/d": 3, "/e": 1}
+    assert seen({}, {}, spool=lacking).notes == (
+        (BAD, "spool: the disk is full"),
+        (NOTE, "spool: 70,000 messages of /b are at its robot and not here yet"),
+        (NOTE, "spool: 3 messages of /d are at its robot and not here yet"),
+        (NOTE, "spool: 2 messages of /c are at its robot and not here yet"),
+        (NOTE, "spool: and of 2 more topics; `sern spool ls` lists them"),
+    )
+
+
 def test_a_configuration_is_in_words() -> None:
     configuration = {
         "rates": {"control": 1.0, "state": 0.5, "bulk": 0.1}, "codec": "zstd", "redundancy": 1,
