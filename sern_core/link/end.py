@@ -30,6 +30,7 @@ class End:
         "peer_boot",
         "resumed",
         "tag",
+        "towards_relay",
         "trace",
         "up_since_s",
         "version",
@@ -42,6 +43,7 @@ class End:
         boot: int,
         peer: ClientName,
         initiator: bool,
+        towards_relay: bool,
         params: LinkParams,
         trace: DecisionTrace,
         now: float,
@@ -52,7 +54,9 @@ class End:
         self.peer_boot: int | None = None
         """The peer's process, now or when there was a session last; None: the next counts as new."""
         self.initiator = initiator
-        """The client's end: it says HELLO."""
+        """It says HELLO: a client's end, and of two relays one."""
+        self.towards_relay = towards_relay
+        """The peer is a relay: it speaks for those behind it, and has yet to learn of them when it is started anew."""
         self.params = params
         self.trace = trace
         self.fates: Fates | None = None

@@ -60,8 +60,9 @@ NUMBER_AND_STAMP: Final = struct.Struct("!IQ")
 class Link:
     """One end of one hop towards `peer`.
 
-    `definitions` is shared by all links of a process. `auto_confirm`: what had its turn here
-    is delivered; a relay confirms by hand, when its subscribers have.
+    `towards_relay`: whether the peer is a relay; None: it is if this end says HELLO, which is a client's.
+    `definitions` is shared by all links of a process. `auto_confirm`: what had its turn here is delivered; a relay
+    confirms by hand, when its subscribers have.
     """
 
     def __init__(
@@ -79,6 +80,7 @@ class Link:
         now: float,
         lossless: bool = True,
         auto_confirm: bool = True,
+        towards_relay: bool | None = None,
     ) -> None:
         self.definitions = definitions
         self.finish: Callable[[Link, float], bool] | None = None
@@ -88,7 +90,16 @@ class Link:
         self.heard_bytes = 0
         """Bytes of all that it has sent, headers included."""
         self._unreadable: RemoteError | None = None  # found at a time when nobody could be told
-        end = self.end = End(name=name, boot=boot, peer=peer, initiator=initiator, params=link, trace=trace, now=now)
+        end = self.end = End(
+            name=name,
+            boot=boot,
+            peer=peer,
+            initiator=initiator,
+            towards_relay=initiator if towards_relay is None else towards_relay,
+            params=link,
+            trace=trace,
+            now=now,
+        )
         owner = self._owner = Owner(self, handler, end)
         self.texts = PeerDefinitions(definitions, peer, max_bytes=link.limits.peer_definition_bytes)
         reassembly = self.reassembly = Reassembly(max(64 * 2**20, 2 * link.max_message_bytes), link.limits)

@@ -73,7 +73,7 @@ class StreamsIn:
         """A session has begun."""
         if resumed:
             return
-        if self._end.initiator:  # a new relay has yet to learn of them
+        if self._end.towards_relay:  # a new relay has yet to learn of them
             for identity in self.streams:
                 self._missing.setdefault(identity, now)
         for stream in self.streams.values():
@@ -237,7 +237,9 @@ class StreamsIn:
 
     def _deliver(self, stream: InStream, message: Message) -> None:
         end = self._end
-        if end.initiator and stream.perishable:  # at the relay the next hop sees that the relay's clock stood still
+        if (
+            end.initiator and self.auto_confirm and stream.perishable
+        ):  # at a relay the next hop sees that the relay's clock stood still
             self._fresh.append((stream, message, self._lanes.clock.steps))
             end.dirty = True
             return

@@ -211,7 +211,7 @@ class StreamsOut:
     def answered(self, want: Want, now: float) -> None:
         """The peer has said whether it wants streams of ours. Raises WireError for more answers than questions."""
         end, reassembly = self._end, self._reassembly
-        if not end.initiator:
+        if not end.towards_relay:
             # Who is required is for origins to remember: a client that takes a stream speaks for itself alone.
             want = replace(want, required=(), add=(), drop=())
             if want.more:

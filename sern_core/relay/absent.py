@@ -23,7 +23,8 @@ MAX_ABSENT_CLIENTS: Final = 1024
 
 
 class AbsentClients:
-    """`known` says whether a name is in the directory of clients."""
+    """`known` says whether a name is in the directory of clients, `home` which peer a client is at: that gets the
+    stream in its place, before it has asked."""
 
     def __init__(
         self,
@@ -33,12 +34,15 @@ class AbsentClients:
         events: GuardedEvents,
         known: Callable[[ClientName], bool],
         limits: PeerLimits,
+        *,
+        home: Callable[[ClientName], ClientName | None],
     ) -> None:
         self._clients = clients
         self._streams = streams
         self._routing = routing
         self._events = events
         self.known = known
+        self._home = home
         self._most_topics = limits.absent_topics
         self._topics: dict[ClientName, set[TopicName]] = {}
         self._subscribed: set[ClientName] = set()  # said what they want, to this run of the relay
@@ -72,6 +76,7 @@ class AbsentClients:
             if client not in self._clients.links and len(self._topics) >= MAX_ABSENT_CLIENTS:
                 continue
             source.reassembly.work_us += ABSENT_US
+            client = self._home(client) or client
             self._clients.link(client, now)
             topics = self._topics.setdefault(client, set())
             if len(topics) >= self._most_topics and identity.topic not in topics:

@@ -6,11 +6,12 @@ from typing import Final
 
 from sern_core.link.handshake import DISPLACED
 from sern_core.link.link import Link
-from sern_core.relay.access import AccessTable, RateGuard
+from sern_core.relay.access import AccessTable, ClientLimits, RateGuard
 from sern_core.relay.bound import QueueBound
 from sern_core.relay.hub_events import GuardedEvents
 from sern_core.relay.hub_port import HubPort
 from sern_core.vocabulary.limits import PeerLimits
+from sern_core.vocabulary.names import is_peer
 from sern_core.vocabulary.types import ClientName
 from sern_core.wire import framing
 
@@ -77,6 +78,15 @@ class Clients:
         self.port_of[port.client] = port
         self._absent_since.pop(port.client, None)
 
+    def call(self, port: HubPort, *, now: float) -> None:
+        """Say hello on a connection to another relay."""
+        older = self.port_of.get(port.client)
+        if older is not None and older is not port:
+            older.link = None
+        port.link = self.link(port.client, now)
+        self.port_of[port.client] = port
+        port.link.connected(now=now)
+
     def came(self, client: ClientName) -> None:
         """A session has begun."""
         self._absent_since.pop(client, None)
@@ -129,7 +139,7 @@ class Clients:
 
     def _limit(self, client: ClientName, now: float) -> None:
         """Put the limits of the access rules in force."""
-        limits = self.access.limits(client)
+        limits = ClientLimits(max_queue_bytes=None) if is_peer(client) else self.access.limits(client)
         guard = self._guards.get(client)
         if guard is None or not guard.holds(limits):  # else what it has used up stays used up
             self._guards[client] = RateGuard.of(limits, now=now)

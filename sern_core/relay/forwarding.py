@@ -106,7 +106,8 @@ class Forwarding:
             behind = behind or channel.watermark >= message.seq
         if stream.stream.spec.durable:
             self.hold(relayed, message, now)
-        if not message.drop_marker:
+        if not message.drop_marker and (message.seq > relayed.kept_seq or relayed.source is None):
+            relayed.kept_seq = max(relayed.kept_seq, message.seq)
             self._keep(relayed, message, now)
         return behind
 

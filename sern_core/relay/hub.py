@@ -32,6 +32,7 @@ from sern_core.relay.hub_matching import Matching
 from sern_core.relay.hub_port import HubPort
 from sern_core.relay.local_streams import LocalStreams
 from sern_core.relay.object_exchange import OBJECTS_TOPIC, ObjectExchange
+from sern_core.relay.peers import Peers, says_hello
 from sern_core.relay.presence import Presence
 from sern_core.relay.relayed_streams import RelayedStreams
 from sern_core.relay.routing import BadPatternError, RouteChange, RoutingLimits, RoutingTable
@@ -42,7 +43,7 @@ from sern_core.stream.out_message import OutMessage
 from sern_core.vocabulary.errors import RefusedError, WireError
 from sern_core.vocabulary.key_news import ClientKeys, RelayKeys
 from sern_core.vocabulary.message import Message
-from sern_core.vocabulary.names import is_client_name, name_problem
+from sern_core.vocabulary.names import is_client_name, is_peer, name_problem, peer_name
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
 from sern_core.vocabulary.types import ClientName, DropReason, TopicName
 from sern_core.wire import framing
@@ -113,8 +114,17 @@ class Hub:
             access, self.events, self._make_link, resume_s=params.resume_s, limits=link.limits
         )
         self.links = clients.links
+        self.peers = Peers(peer_name(name), clients, self.routing, displaced=self._displaced, changed=self._moved)
+        """The other relays, where there is a fabric."""
+        self.routing.stays = self.local_owners
         self.presence = Presence(
-            clients.links, self.local_owners, self.matching.due_s, clients.attempt, self._was_read, link.limits
+            clients.links,
+            self.local_owners,
+            self.matching.due_s,
+            clients.attempt,
+            self._was_read,
+            link.limits,
+            home=self.peers.home,
         )
         streams = self.streams = RelayedStreams(
             clients,
@@ -145,16 +155,20 @@ class Hub:
         """Durable streams, where the shell has a place on disk for them."""
         streams.on_disk = self.holding.position
         self.forwarding.hold = self.holding.message
-        self.absent = AbsentClients(clients, streams, self.routing, self.events, known, link.limits)
+        self.absent = AbsentClients(
+            clients, streams, self.routing, self.events, known, link.limits, home=self.peers.home
+        )
 
     # --- how the parts hang together ------------------------------------------------------------------------------
 
     def _make_link(self, client: ClientName, now: float) -> Link:
+        own = self.peers.own if is_peer(client) else self.name
         link = Link(
-            name=self.name,
+            name=own,
             boot=self.boot,
             peer=client,
-            initiator=False,
+            initiator=is_peer(client) and says_hello(own, client),
+            towards_relay=is_peer(client),
             handler=self,
             definitions=self.definitions,
             link=self._link_params,
@@ -221,8 +235,10 @@ class Hub:
         self.presence.sweep(now=now)
 
     def tell_objects(self, *, now: float) -> None:
-        """Tell clients what has changed of the objects that they subscribe to. Call ten times a second."""
+        """Tell clients what has changed of the objects that they subscribe to, and peers what is wanted here. Call ten
+        times a second."""
         self.exchange.pump(now=now)
+        self.peers.ask(now=now)
         self.after()
 
     def lapse(self, *, now: float) -> bool:
@@ -233,6 +249,8 @@ class Hub:
     def left(self, client: ClientName, *, now: float) -> None:
         """A client has said goodbye. One that has streams, or wants reliable ones, may come back to them (a daemon that
         is started anew), and is waited for like any other; the others are forgotten."""
+        if is_peer(client):
+            return
         channels = self.links[client].sender.channels.values()
         if not self.routing.streams_of(client) and not any(channel.reliable for channel in channels):
             self._forget(client, now)
@@ -255,6 +273,31 @@ class Hub:
         self.absent.forget(client)
         self.objects.delete_owned(client)
         self.exchange.forget(client)
+        if is_peer(client):
+            self.peers.lost(client, now=now)
+        else:
+            self.peers.left(client, now=now)
+
+    # --- other relays ---------------------------------------------------------------------------------------------
+
+    def add_peer(self, relay: ClientName, address: str = "") -> HubPort:
+        """There is another relay of the fabric, which `address` leads to: the port of the hop between the two."""
+        peer = peer_name(relay)
+        self.peers.add(peer)
+        return HubPort(self, peer, address, greets=says_hello(self.peers.own, peer))
+
+    def _displaced(self, client: ClientName, peer: ClientName, now: float) -> None:
+        """A client that has a session here has begun another one at a peer."""
+        self.clients.end_session(client, f"{client} has connected to the relay {peer[1:]}", now=now)
+
+    def _moved(self, client: ClientName, now: float) -> None:
+        """A client has come to a peer, or left it. What is held for it here goes there."""
+        self.presence.changed(client, now=now)
+        peer = self.peers.home(client)
+        if peer is not None and client in self.links:
+            self.absent.forget(client)
+            self.matching.forget(client)
+            self.streams.hand_over(client, peer, now)
 
     def revoke(self, access: AccessTable, *, now: float) -> None:
         """New access rules: what they no longer allow ends now."""
@@ -305,6 +348,13 @@ class Hub:
 
     def on_up(self, link: Link, *, resumed: bool, now: float) -> None:
         self.clients.came(link.peer)
+        if is_peer(link.peer):
+            self.peers.up(link, now=now)
+            if not resumed:
+                self.streams.prime(link, now)
+            self.events.peer_up(link.peer)
+            return
+        self.peers.came(link.peer, now=now)
         if link.end.peer_boot is not None:
             self.routing.returned(link.peer, link.end.peer_boot)
         self._subscriptions.pop(link.peer, None)  # half of one that was said in an earlier session
@@ -316,6 +366,9 @@ class Hub:
 
     def on_down(self, link: Link, reason: str, *, now: float) -> None:
         self.clients.went(link.peer, now)
+        if is_peer(link.peer):
+            self.events.peer_down(link.peer, reason)
+            return
         self.presence.changed(link.peer, now=now)
         self.holding.went(link.peer)
         self.events.client_down(link.peer, reason)
@@ -324,14 +377,19 @@ class Hub:
         self.events.lane_closed(link.peer)
 
     def on_rejected(self, link: Link, code: str, text: str, *, now: float) -> None:
-        """A relay is never the initiator."""
-        raise WireError("REFUSE is not for a relay")
+        """Another relay does not take us: it says why."""
+        self.events.refused(link.peer, code, text)
 
     def on_announce(self, link: Link, announcement: Announcement, *, now: float) -> bool | None:
         stream = link.taking.streams[announcement.stream.id]
         identity = stream.stream.id
+        if is_peer(link.peer):
+            if self.peers.home(identity.origin) != link.peer:
+                raise RefusedError(
+                    "origin", f"{link.peer[1:]} announced a stream of {identity.origin}, who is not there"
+                )
         # What is kept on disk has the number of its store, which is the origin's to draw.
-        if identity.origin != link.peer or (identity.boot != link.end.peer_boot and not stream.stream.spec.durable):
+        elif identity.origin != link.peer or (identity.boot != link.end.peer_boot and not stream.stream.spec.durable):
             raise RefusedError("origin", f"{link.peer} announced a stream of {identity.origin}")
         if identity.topic == OBJECTS_TOPIC:
             return True
@@ -351,7 +409,11 @@ class Hub:
         return None
 
     def on_retract(self, link: Link, stream: InStream, *, now: float) -> None:
-        if stream.stream.id.topic != OBJECTS_TOPIC:
+        identity = stream.stream.id
+        relayed = self.relayed.get(identity)
+        if relayed is not None and relayed.source is not link and (is_peer(link.peer) or self.routing.via(identity)):
+            return  # it comes from elsewhere by now
+        if identity.topic != OBJECTS_TOPIC:
             self.streams.retract(link, stream, now)
 
     def on_message(self, link: Link, stream: InStream, message: Message, *, now: float) -> None:
@@ -394,7 +456,9 @@ class Hub:
             self.clients.attempt(client, now, skip)
 
     def on_wanted(self, link: Link, channel: OutChannel, *, now: float) -> None:
-        """Nothing depends on it here: what a client subscribed to it gets."""
+        """What a client subscribed to it gets; a peer says who gets it behind it, and the origin is to know."""
+        if is_peer(link.peer):
+            self.streams.refresh_interest([channel.stream.id], now=now)
 
     def on_definition(self, link: Link, digest: str, *, now: float) -> None:
         link.reassembly.work_us += len(self.links) + len(self.relayed) // STREAMS_PER_US
@@ -406,7 +470,9 @@ class Hub:
 
     def on_control(self, link: Link, envelope: framing.Envelope, attachment: bytes, *, now: float) -> None:
         kind = envelope["t"]
-        if kind == "subscribe":
+        if is_peer(link.peer):
+            self._on_peer_control(link, kind, envelope, now)
+        elif kind == "subscribe":
             self._subscribe(link.peer, envelope, now)
         elif kind == "objects":
             try:
@@ -427,6 +493,19 @@ class Hub:
         elif kind == "lane_ask":
             link.reassembly.work_us += LANE_US
             self.events.lane_asked(link.peer, framing.take_strings(envelope, "ciphers", max_length=64))
+        else:
+            raise WireError(f"unknown control message {kind!r}")
+
+    def _on_peer_control(self, link: Link, kind: str, envelope: framing.Envelope, now: float) -> None:
+        if kind == "subscribe":
+            self._subscribe(link.peer, envelope, now)
+        elif kind == "here":
+            self.peers.told(link.peer, envelope, now=now)
+        elif kind == "left":
+            self.peers.told_left(link.peer, envelope, now=now)
+        elif kind == "denied":
+            code = framing.take_str(envelope, "code", max_length=64)
+            self.events.refused(link.peer, code, framing.take_str(envelope, "why"))
         else:
             raise WireError(f"unknown control message {kind!r}")
 
@@ -510,3 +589,4 @@ class Hub:
             for channel in link.sender.channels.values():
                 assert id(channel) in held_channels, f"{channel.stream.id.topic}: nobody's channel to {client}"
         self.absent.validate(self.links)
+        self.peers.validate()

@@ -10,6 +10,7 @@ from sern_core.stream.latched import MAX_REPLAY_MESSAGES, LatchedCache, ReplaySt
 from sern_core.stream.out_channel import OutChannel
 from sern_core.vocabulary.key_news import ClientKeys
 from sern_core.vocabulary.message import Message, StreamInfo
+from sern_core.vocabulary.names import is_peer
 from sern_core.vocabulary.types import ClientName
 
 
@@ -19,6 +20,12 @@ class HubEvents(Protocol):
     def client_up(self, client: ClientName, *, resumed: bool) -> None: ...
 
     def client_down(self, client: ClientName, reason: str) -> None: ...
+
+    def peer_up(self, peer: ClientName) -> None:
+        """The session with another relay (`peers.peer_name`) has begun."""
+
+    def peer_down(self, peer: ClientName, reason: str) -> None:
+        """It has ended."""
 
     def stream_added(self, stream: StreamInfo) -> None: ...
 
@@ -73,6 +80,12 @@ class GuardedEvents:
     def client_down(self, client: ClientName, reason: str) -> None:
         self._tell(self.shell.client_down, client, reason)
 
+    def peer_up(self, peer: ClientName) -> None:
+        self._tell(self.shell.peer_up, peer)
+
+    def peer_down(self, peer: ClientName, reason: str) -> None:
+        self._tell(self.shell.peer_down, peer, reason)
+
     def stream_added(self, stream: StreamInfo) -> None:
         self._tell(self.shell.stream_added, stream)
 
@@ -101,7 +114,7 @@ class GuardedEvents:
 class Relayed:
     """One stream at the relay: where it comes from (None: the relay itself), where it goes, what is kept of it."""
 
-    __slots__ = ("cache", "outs", "source", "stream", "unopened", "waiting")
+    __slots__ = ("cache", "kept_seq", "outs", "source", "stream", "unopened", "waiting")
 
     def __init__(self, source: Link | None, stream: InStream, replays: ReplayStore) -> None:
         self.source = source
@@ -109,12 +122,18 @@ class Relayed:
         self.outs: dict[ClientName, tuple[Link, OutChannel]] = {}
         self.waiting: dict[ClientName, None] = {}  # subscribers that are still to be told of it, in their order
         self.unopened: set[ClientName] = set()  # subscribers towards whom no channel could be opened; they were told
+        self.kept_seq = 0  # of the newest message that was looked at for what the relay keeps
         self.cache: LatchedCache | None = None
         self.keep_latched(replays)
 
     def required(self) -> tuple[ClientName, ...]:
-        """Who gets the stream, and who is about to."""
-        return tuple(dict.fromkeys((*self.outs, *self.waiting)) if self.waiting else self.outs)
+        """Who gets the stream, and who is about to; of a peer those behind it who do."""
+        if not any(map(is_peer, self.outs)):
+            return tuple(name for name in dict.fromkeys((*self.outs, *self.waiting)) if not is_peer(name))
+        names: dict[ClientName, None] = {}
+        for name, (_link, channel) in self.outs.items():
+            names |= dict.fromkeys(map(ClientName, channel.required) if is_peer(name) else (name,))
+        return tuple(names | dict.fromkeys(name for name in self.waiting if not is_peer(name)))
 
     def keep_latched(self, replays: ReplayStore) -> None:
         """Keep as many messages for late joiners as the stream's properties say by now."""

@@ -27,6 +27,8 @@ class PortClients(Protocol):
 
     def greet(self, port: "HubPort", hello: framing.Envelope, header: framing.Header, *, now: float) -> None: ...
 
+    def call(self, port: "HubPort", *, now: float) -> None: ...
+
     def failed(self, client: ClientName, error: Exception, *, now: float) -> None: ...
 
 
@@ -48,12 +50,13 @@ class PortHub(Protocol):
 
 class HubPort:
     """One transport connection of one client, as the lane below sees it. `client` is bound to the peer's key;
-    `address` is where it comes from, for people."""
+    `address` is where it comes from, for people. `greets`: it leads to another relay, to which we say HELLO."""
 
-    def __init__(self, hub: PortHub, client: ClientName, address: str = "") -> None:
+    def __init__(self, hub: PortHub, client: ClientName, address: str = "", *, greets: bool = False) -> None:
         self.hub = hub
         self.client = client
         self.address = address
+        self._greets = greets
         self.link: Link | None = None
         self._out: list[bytes] = []
         self._reset_due_s = -float("inf")
@@ -63,7 +66,9 @@ class HubPort:
         return self.link is not None and self.hub.clients.port_of.get(self.client) is self
 
     def connected(self, *, now: float) -> None:
-        """The client speaks first."""
+        """A client speaks first."""
+        if self._greets:
+            self.hub.clients.call(self, now=now)
 
     def disconnected(self, *, now: float) -> None:
         if self.current and self.link is not None:

@@ -94,7 +94,8 @@ class _Watcher:
 class Presence:
     """`links` is the relay's table, `local` the names under which the relay itself publishes, which are nobody's peers.
     `matching` has the clients of whom it is not known yet what they take. `attempt` does something about a client so
-    that its failure is that client's; `after` is called when something was said."""
+    that its failure is that client's; `after` is called when something was said; `home` names the peer that a client is
+    at, who is as well reached as that."""
 
     def __init__(
         self,
@@ -104,12 +105,15 @@ class Presence:
         attempt: Callable[[ClientName, float, Callable[[], object]], None],
         after: Callable[[], None],
         limits: PeerLimits,
+        *,
+        home: Callable[[ClientName], ClientName | None],
     ) -> None:
         self._links = links
         self._local = local
         self._matching = matching
         self._attempt = attempt
         self._after = after
+        self._home = home
         self._told_at_once = limits.told_at_once
         self._taken: dict[ClientName, Counter[ClientName]] = {}  # streams that a client takes, by origin
         self._subscribers: dict[ClientName, set[ClientName]] = {}  # the same the other way round
@@ -214,7 +218,7 @@ class Presence:
                 watching.back[peer] = now
 
     def _look(self, client: ClientName, now: float) -> None:
-        link = self._links.get(client)
+        link = self._links.get(self._home(client) or client)
         view = None if link is None else link.observe(now=now)
         old = self._states.get(client)
         up = view is not None and view.up
@@ -250,7 +254,7 @@ class Presence:
         self._after()
 
     def _here(self, client: ClientName) -> bool:
-        link = self._links.get(client)
+        link = self._links.get(self._home(client) or client)
         return link is not None and link.established
 
     def _item(self, client: ClientName, watching: _Watcher, peer: ClientName, now: float) -> framing.Envelope:

@@ -19,6 +19,7 @@ from sern_core.stream.out_channel import OutChannel
 from sern_core.vocabulary.errors import RefusedError, UsageError, WireError
 from sern_core.vocabulary.limits import PeerLimits
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo
+from sern_core.vocabulary.names import is_peer
 from sern_core.vocabulary.types import ClientName, DropReason
 from sern_core.wire.announce import check_onwards
 
@@ -79,7 +80,8 @@ class RelayedStreams:
             except WireError as error:
                 text = f"{identity.origin} may not publish {identity.topic[:80]!r}: nobody would take its announcement"
                 raise RefusedError("bad_announcement", f"{text}: {error}") from None
-            change = self._routing.announce(stream.stream)
+            via = source.peer if source is not None and is_peer(source.peer) else None
+            change = self._routing.announce(stream.stream, via=via)
         except RefusedError:
             self.apply(self._routing.withdraw(identity), now)
             refused = self.by_id.pop(identity, None)
@@ -199,7 +201,8 @@ class RelayedStreams:
     def _may_drain(self, client: ClientName, stream: StreamId) -> bool:
         """Whether the rules allow what an ended stream left behind."""
         access = self._clients.access
-        return access.may_subscribe(client, stream.topic) and access.may_publish(stream.origin, stream.topic)
+        may = is_peer(client) or access.may_subscribe(client, stream.topic)
+        return may and access.may_publish(stream.origin, stream.topic)
 
     # --- to subscribers -------------------------------------------------------------------------------------------
 
@@ -269,6 +272,33 @@ class RelayedStreams:
         else:
             self.draining.add(client, link, channel, max_bytes=self._clients.max_queue_bytes(client), now=now)
 
+    def hand_over(self, client: ClientName, peer: ClientName, now: float) -> None:
+        """The client is at a peer: that gets the streams in its place, from what the client has not confirmed."""
+        for identity in self._routing.received_by(client):
+            relayed = self.by_id[identity]
+            pair = relayed.outs.get(client)
+            if pair is None or not pair[1].reliable or not self._routing.offers(peer, identity):
+                continue
+            held = pair[1]
+            if peer not in relayed.outs:
+                first = min(held.watermark + 1, relayed.stream.delivered + 1)
+                self._clients.link(peer, now)
+                change = self._routing.also(peer, identity.topic)
+                others = tuple(match for match in change.matched if match.stream != identity)
+                self.apply(RouteChange(matched=others), now)
+                self.offer(peer, identity, now, first=first)
+                taken = relayed.outs.get(peer)
+                if taken is not None:
+                    for out in list(held.retained):
+                        if out.seq >= taken[1].next_seq and not out.message.replay:
+                            if out.seq > taken[1].next_seq:
+                                taken[0].outgoing.skip(taken[1], out.seq, now=now)
+                            taken[0].sender.submit(taken[1], out.message, now=now, forced=True)
+                self._close(client, identity, DropReason.UNWANTED, now)
+            else:  # what the peer has had already for others does not come to it again
+                self._close(client, identity, DropReason.DISCONNECTED, now)
+        self.apply(self._routing.subscribe(client), now)
+
     def prime(self, link: Link, now: float) -> None:
         """The client is another process than before: it gets what is latched of all that it takes."""
         for relayed in self.by_id.values():
@@ -280,7 +310,9 @@ class RelayedStreams:
         """The latched messages that a late joiner may have before `first`: of those that are not too many for what may
         wait for it the newest, the others are counted as `queue_full`."""
         client, stream, cache = link.peer, relayed.stream.stream, relayed.cache
-        if cache is None or cache.empty or not self._clients.access.may_replay(client, stream.id.topic):
+        if cache is None or cache.empty:
+            return []
+        if not (is_peer(client) or self._clients.access.may_replay(client, stream.id.topic)):
             return []
         messages = self.replays.below(cache, first)
         for payer in (link, relayed.source):  # whoever of them is being read has set it off, and it counts there

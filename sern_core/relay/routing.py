@@ -19,13 +19,18 @@ Names
   of two processes with one name each may. Streams that their origin keeps on disk go on from one process to the next:
   their number is the store's, and another one replaces the stream of that name alone.
 
+Peers
+- Another relay is a client of another kind, a *peer* (`sern_core/relay/peers.py`): it subscribes for the clients behind
+  it, whose rights it checks, and announces their streams, which keep their origins (`via`). What came from a peer is
+  offered to clients alone, so nothing goes round in circles; nor does a peer get what a relay publishes itself.
+
 Who announces is the caller's business: `StreamInfo.id.origin` must be the name bound to the peer's key.
 """
 
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Container, Iterable
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 from sern_core.relay.access import AccessTable
@@ -45,6 +50,10 @@ ROUTE_UNITS: Final = 20_000
 """What follows from a route that comes or goes: a channel, its announcement, an answer to the origin."""
 COMPILE_UNITS: Final = 200
 """Compiling, for each instruction of the program and each character of a pattern."""
+
+
+PEER_TIMES: Final = 64
+"""A peer speaks for many clients: it may want so many times as much as one."""
 
 
 class BadPatternError(RefusedError):
@@ -144,6 +153,11 @@ class RoutingTable:
     def __init__(self, access: AccessTable, *, limits: RoutingLimits | None = None) -> None:
         self._access = access
         self._limits = limits or RoutingLimits()
+        self.peers: set[ClientName] = set()
+        """The names of other relays; set by the owner."""
+        self.stays: Container[ClientName] = ()
+        """Origins whose streams no peer gets; set by the owner."""
+        self._via: dict[StreamId, ClientName] = {}  # the peer that a stream came from
         self._infos: dict[StreamId, StreamInfo] = {}
         self._routes: dict[StreamId, tuple[ClientName, ...]] = {}
         self._topics: dict[TopicName, _Topic] = {}
@@ -184,14 +198,17 @@ class RoutingTable:
         topics = interest.topics if interest is not None else set()
         return tuple(
             sorted(
-                stream for topic in topics for origin, stream in self._topics[topic].streams.items() if origin != client
+                stream
+                for topic in topics
+                for stream in self._topics[topic].streams.values()
+                if self._gets(client, stream)
             )
         )
 
     def takes(self, client: ClientName, topic: TopicName) -> bool:
         """Whether the client wants the global name and may have it, whether or not there is such a stream."""
         interest = self._interests.get(client)
-        return interest is not None and self._access.may_subscribe(client, topic) and interest.wants(topic)
+        return interest is not None and self._may_have(client, topic) and interest.wants(topic)
 
     def owners(self, topic: TopicName) -> tuple[ClientName, ...]:
         """The clients that hold the global name, first come first."""
@@ -204,6 +221,20 @@ class RoutingTable:
         used.update((client, topic) for client, interest in self._interests.items() for topic in interest.topics)
         return tuple(sorted(used))
 
+    def via(self, stream: StreamId) -> ClientName | None:
+        """The peer that announced the stream; None: a client did, or the relay itself."""
+        return self._via.get(stream)
+
+    def offers(self, client: ClientName, stream: StreamId) -> bool:
+        """Whether the client would get the stream if it wanted its name."""
+        return self._gets(client, stream) and self._may_have(client, stream.topic)
+
+    def interests(self) -> tuple[list[str], list[TopicName]]:
+        """The patterns and names that clients want, each once, sorted: what this relay asks its peers for."""
+        wanting = [interest for client, interest in self._interests.items() if client not in self.peers]
+        patterns = {text for interest in wanting for text in interest.patterns.texts}
+        return sorted(patterns), sorted({name for interest in wanting for name in interest.exact})
+
     def unfinished(self, client: ClientName) -> bool:
         """Whether there are names that the client's interest was not matched with yet: call `go_on`."""
         interest = self._interests.get(client)
@@ -211,8 +242,8 @@ class RoutingTable:
 
     # Changes ---------------------------------------------------------------------------------------------------------
 
-    def announce(self, stream: StreamInfo) -> RouteChange:
-        """A client offers a stream, or offers it again with other properties.
+    def announce(self, stream: StreamInfo, *, via: ClientName | None = None) -> RouteChange:
+        """A client offers a stream, or offers it again with other properties, or from another place: `via` a peer.
 
         Raises RefusedError with code `bad_name`, `forbidden`, `name_taken`, `type_mismatch`, `old_boot` or
         `too_many_streams`.
@@ -220,15 +251,18 @@ class RoutingTable:
         self.spent_units = 0
         origin, boot, _ = stream.id
         known = self._infos.get(stream.id)
-        if known is not None and _same(known, stream):
+        moved = known is not None and self._via.get(stream.id) != via
+        if known is not None and _same(known, stream) and not moved:
             return NO_CHANGE
         durable = stream.spec.durable
         reboot = not durable and self._boots.get(origin, boot) != boot
         self._check(stream, reboot=reboot)
+        change = _Collector()
         if known is not None:
             self._infos[stream.id] = stream
-            return RouteChange(updated=(stream.id,))
-        change = _Collector()
+            if moved:
+                self._move(stream.id, via, change)
+            return replace(change.result(self._routes), updated=() if _same(known, stream) else (stream.id,))
         if reboot:
             for old in tuple(self._by_client.get(origin, {}).values()):
                 if not self._infos[old].spec.durable:
@@ -239,6 +273,8 @@ class RoutingTable:
         namesake = self._by_client.get(origin, {}).get(stream.id.topic)
         if namesake is not None:
             self._remove(namesake, change)
+        if via is not None:
+            self._via[stream.id] = via
         self._add(stream, change)
         return change.result(self._routes)
 
@@ -260,19 +296,20 @@ class RoutingTable:
         self.spent_units = NAME_UNITS
         texts = tuple(dict.fromkeys(patterns))
         names = set(exact)
-        if len(texts) > self._limits.max_patterns or len(names) > self._limits.max_exact:
+        many = PEER_TIMES if client in self.peers else 1
+        if len(texts) > many * self._limits.max_patterns or len(names) > many * self._limits.max_exact:
             raise RefusedError(
                 "too_many_patterns",
                 f"{client} asks for {len(texts)} patterns and {len(names)} names; at most {self._limits.max_patterns} "
                 f"and {self._limits.max_exact} are taken; join patterns with '|'",
             )
         old = self._interests.get(client)
-        denied = [Denied(client, name) for name in names if not self._access.may_subscribe(client, name)]
+        denied = [Denied(client, name) for name in names if not self._may_have(client, name)]
         if old is not None and old.patterns.texts == texts and old.exact == names:
             return RouteChange(denied=tuple(sorted(denied)))  # said again: it may be another process that asks
         self.spent_units += COMPILE_UNITS * sum(map(len, texts))
         try:
-            wanted = PatternSet(texts, max_program=self._limits.max_program)
+            wanted = PatternSet(texts, max_program=many * self._limits.max_program)
         except PatternError as error:
             raise _refused(error, client) from None
         self.spent_units += COMPILE_UNITS * wanted.program
@@ -297,7 +334,7 @@ class RoutingTable:
             interest = self._interests[client] = _Interest(PatternSet(()), exact)
         exact.add(topic)
         change = _Collector()
-        if not self._access.may_subscribe(client, topic):
+        if not self._may_have(client, topic):
             change.denied.add(Denied(client, topic))
         elif topic in self._topics and topic not in interest.topics:
             interest.topics.add(topic)
@@ -320,14 +357,21 @@ class RoutingTable:
             retired.remove(boot)
 
     def drop_client(self, client: ClientName) -> RouteChange:
-        """The client is gone for good: its streams, its names and its interest go. It may come back under any boot."""
+        """The client is gone for good: its streams, its names and its interest go. It may come back under any boot, and
+        what it has at another relay stays. With a peer goes all that came from it."""
         change = _Collector()
         self._set_interest(client, None, change)
-        for stream in tuple(self._by_client.get(client, {}).values()):
+        if client in self.peers:
+            streams = [stream for stream, via in self._via.items() if via == client]
+        else:
+            streams = [stream for stream in self._by_client.get(client, {}).values() if stream not in self._via]
+        for stream in streams:
             self._remove(stream, change)
-        self._by_client.pop(client, None)
-        self._boots.pop(client, None)
-        self._retired.pop(client, None)
+        for origin in {client, *(stream.origin for stream in streams)}:
+            if not self._by_client.get(origin):
+                self._by_client.pop(origin, None)
+                self._boots.pop(origin, None)
+                self._retired.pop(origin, None)
         return change.result(self._routes)
 
     def set_access(self, access: AccessTable) -> RouteChange:
@@ -343,15 +387,36 @@ class RoutingTable:
             change.denied.update(
                 Denied(client, name)
                 for name in interest.exact
-                if before.may_subscribe(client, name) and not access.may_subscribe(client, name)
+                if before.may_subscribe(client, name) and not self._may_have(client, name)
             )
             for name in sorted(interest.topics):
-                if not access.may_subscribe(client, name):
+                if not self._may_have(client, name):
                     interest.topics.discard(name)
                     self._set_subscriber(client, name, change, takes=False)
             interest.left = self._to_look_at(interest)
             self._match_some(client, interest, change)
         return change.result(self._routes)
+
+    # Peers ----------------------------------------------------------------------------------------------------------
+
+    def _may_have(self, client: ClientName, name: TopicName) -> bool:
+        """Whether the rules let a client have a topic. A peer is asked for what its clients want, and judges them."""
+        return client in self.peers or self._access.may_subscribe(client, name)
+
+    def _gets(self, client: ClientName, stream: StreamId) -> bool:
+        """Whether a subscriber of the stream's name gets the stream."""
+        if client in self.peers:
+            return stream not in self._via and stream.origin not in self.stays
+        return client != stream.origin
+
+    def _move(self, stream: StreamId, via: ClientName | None, change: "_Collector") -> None:
+        """The stream is announced from another place than before."""
+        change.before.setdefault(stream, self._routes[stream])
+        self._via.pop(stream, None)
+        if via is not None:
+            self._via[stream] = via
+        subscribers = self._topics[stream.topic].subscribers
+        self._routes[stream] = tuple(sorted(client for client in subscribers if self._gets(client, stream)))
 
     # Internals -------------------------------------------------------------------------------------------------------
 
@@ -413,12 +478,13 @@ class RoutingTable:
                     topic.subscribers.add(client)
         topic.streams[origin] = stream.id
         change.before.setdefault(stream.id, ())
-        self._routes[stream.id] = tuple(sorted(topic.subscribers - {origin}))
+        self._routes[stream.id] = tuple(sorted(client for client in topic.subscribers if self._gets(client, stream.id)))
 
     def _remove(self, stream: StreamId, change: "_Collector") -> None:
         change.removed.add(stream)
         change.before.setdefault(stream, self._routes.pop(stream))
         del self._infos[stream]
+        self._via.pop(stream, None)
         del self._by_client[stream.origin][stream.topic]
         topic = self._topics[stream.topic]
         del topic.streams[stream.origin]
@@ -449,11 +515,11 @@ class RoutingTable:
         """Whether the client wants the name and may have it. What may take long is asked last."""
         steps = interest.patterns.steps(name)
         if steps:
-            if not self._access.may_subscribe(client, name):
+            if not self._may_have(client, name):
                 return False
             self.spent_units += steps * len(name)
             return interest.wants(name)
-        return interest.wants(name) and self._access.may_subscribe(client, name)
+        return interest.wants(name) and self._may_have(client, name)
 
     def _match_some(self, client: ClientName, interest: _Interest, change: "_Collector") -> None:
         """Match names that are left against the client's rights and interest, one slice of them at least by one."""
@@ -479,7 +545,7 @@ class RoutingTable:
         topic = self._topics[name]
         (topic.subscribers.add if takes else topic.subscribers.discard)(client)
         for stream in topic.streams.values():
-            if stream.origin != client:
+            if self._gets(client, stream):
                 route = self._routes[stream]
                 change.before.setdefault(stream, route)
                 at = bisect_left(route, client)
@@ -494,8 +560,8 @@ class RoutingTable:
                 sorted(
                     client
                     for client, interest in self._interests.items()
-                    if client != stream.origin
-                    and self._access.may_subscribe(client, name)
+                    if self._gets(client, stream)
+                    and self._may_have(client, name)
                     and (client in route if name in interest.left else interest.wants(name))
                 )
             )
@@ -506,6 +572,7 @@ class RoutingTable:
             assert self._by_client[stream.origin][name] == stream, f"{stream} is not among its origin's streams"
             assert self._access.may_publish(stream.origin, name), f"{stream} may not be published"
         assert self._routes.keys() == self._infos.keys(), "routes of unknown streams"
+        assert self._via.keys() <= self._infos.keys(), "places of unknown streams"
         assert sum(map(len, self._by_client.values())) == len(self._infos), "streams by client differ"
         assert sum(len(topic.streams) for topic in self._topics.values()) == len(self._infos), "names differ"
         for name, topic in self._topics.items():

@@ -36,6 +36,20 @@ def is_client_name(name: str) -> bool:
     return _CLIENT_NAME.fullmatch(name) is not None
 
 
+PEER_SIGN: Final = "@"
+"""How the name of another relay begins where clients are called by their names; no client's does."""
+
+
+def peer_name(relay: str) -> ClientName:
+    """What another relay is called where clients are called by their names."""
+    return ClientName(PEER_SIGN + relay)
+
+
+def is_peer(name: str) -> bool:
+    """Whether it is the name of another relay."""
+    return name.startswith(PEER_SIGN)
+
+
 def client_name(name: str) -> ClientName:
     """`name` as a checked ClientName; UsageError otherwise."""
     if not is_client_name(name):
