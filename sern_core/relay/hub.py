@@ -136,6 +136,7 @@ class Hub:
             wall_ns=wall_ns,
             ended=self._own_ended,
             limits=link.limits,
+            now=now,
         )
         self.relayed = streams.by_id
         self.forwarding = Forwarding(name, clients, streams, self.objects, self.events)
@@ -220,6 +221,7 @@ class Hub:
                 self.clients.attempt(client, now, partial(self._forget, client, now))
         self.clients.sweep_orphans(now)
         self.streams.draining.sweep(now=now)
+        self.streams.sweep(now)
         self.holding.look(now=now)
         self.clients.sweep(now)
         if now >= self._tidy_due_s:
@@ -405,7 +407,7 @@ class Hub:
             relayed.source = None  # one answer for all who are absent
             self.absent.hold(announcement.required, identity, link, now)
         relayed.source = link
-        link.answers.answer(stream, self.streams.wanted(relayed), now=now, required=relayed.required())
+        self.streams.answer(relayed, now)
         return None
 
     def on_retract(self, link: Link, stream: InStream, *, now: float) -> None:

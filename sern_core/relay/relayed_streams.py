@@ -26,6 +26,9 @@ from sern_core.wire.announce import check_onwards
 STREAM_US: Final = 50
 REPLAY_US: Final = 2
 """What it is charged with, in microseconds, to take or end a stream, and to replay a message."""
+LEARNING_S: Final = 30.0
+"""For so long after its start a relay does not say of a durable stream that nobody wants it. Who does may not have come
+back yet, and where the robot died as well before it had on disk who that is, nobody else can tell."""
 MAX_DENIED: Final = 64
 """Topics of one subscription that a client is told it may not have; a client has no use for a longer list."""
 
@@ -45,6 +48,7 @@ class RelayedStreams:
         wall_ns: Callable[[float], int],
         ended: Callable[[Relayed, float], None],
         limits: PeerLimits,
+        now: float,
     ) -> None:
         self._clients = clients
         self._routing = routing
@@ -62,6 +66,7 @@ class RelayedStreams:
         """Whether the relay itself wants a stream (a subscriber of the feed); set by the shell."""
         self.on_disk: Callable[[StreamId], int] = lambda _stream: 0
         """Up to which seq a durable stream is on disk here; set by the owner."""
+        self._learns_until_s: float | None = now + LEARNING_S
         self._unsubscribed: OutChannel | None = None  # is being closed because its subscriber wants it no more
         self._room: tuple[ClientName, float, int] | None = None  # for replays to a client at this time
 
@@ -349,13 +354,26 @@ class RelayedStreams:
         self._answer(relayed, now)
         self.confirm(relayed)
 
-    def _answer(self, relayed: Relayed, now: float) -> None:
-        """Tell the origin whether anybody wants its stream."""
+    def answer(self, relayed: Relayed, now: float) -> None:
+        """Tell the origin whether anybody wants its stream, unless that is not known yet."""
         source = relayed.source
-        if source is not None:
-            wanted, required = self.wanted(relayed), relayed.required()
-            answer = partial(source.answers.answer, relayed.stream, wanted, now=now, required=required)
-            self._clients.attempt(source.peer, now, answer)
+        if source is None:
+            return
+        wanted, required = self.wanted(relayed), relayed.required()
+        if not wanted and relayed.stream.stream.spec.durable and self._learns_until_s is not None:
+            return
+        source.answers.answer(relayed.stream, wanted, now=now, required=required)
+
+    def _answer(self, relayed: Relayed, now: float) -> None:
+        if relayed.source is not None:
+            self._clients.attempt(relayed.source.peer, now, partial(self.answer, relayed, now))
+
+    def sweep(self, now: float) -> None:
+        """Call about once a second: clients have had the time to come back."""
+        if self._learns_until_s is not None and now >= self._learns_until_s:
+            self._learns_until_s = None
+            durable = [identity for identity, relayed in self.by_id.items() if relayed.stream.stream.spec.durable]
+            self.refresh_interest(durable, now=now)
 
     def wanted(self, relayed: Relayed) -> bool:
         """Whether anybody takes the stream, or may later."""

@@ -7,6 +7,7 @@ be in the site's recording at the end, once, and in order.
 
 import argparse
 import asyncio
+import shutil
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -119,8 +120,13 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as name:
-        kills = asyncio.run(play(Path(name), options.seed, options.kills, said=True))
+    directory = Path(tempfile.mkdtemp(prefix="sern-kills-"))
+    try:
+        kills = asyncio.run(play(directory, options.seed, options.kills, said=True))
+    except AssertionError:
+        print(f"\nlogs, disks and the recording are in {directory}")
+        raise
+    shutil.rmtree(directory)
     told = f"{sum(kills.acknowledged)} acknowledged messages of {len(kills.acknowledged)} runs"
     print(f"\n{kills.kills} kills: {told}, none lost or doubled")
     return 0

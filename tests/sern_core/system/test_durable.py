@@ -182,3 +182,26 @@ def test_a_site_knows_what_it_has_of_a_stream_that_was_gone_for_a_while() -> Non
     play.robot.begin(again)
     play.world.run(3.0)
     play.check()
+
+
+@pytest.mark.parametrize("relay_disk", [True, False])
+def test_what_a_robot_acknowledged_before_it_knew_for_whom_waits_for_those_who_come_back(relay_disk: bool) -> None:
+    """Robot and relay die before the robot has on disk who takes the topic, and the robot is back before the site: the
+    next relay knows nothing of the site, and does not say that nobody wants the topic."""
+    play = Play(11, relay_disk=relay_disk, site=replace(THIN, reconnect_s=8.0))
+    play.robot.disk = SimDisk()
+    play.kill_both()
+    play.world.run(20.0)
+    play.check()
+    assert min(int(got.body) for got in play.site.on(TOPIC)) == 1
+
+
+def test_what_nobody_takes_is_let_go_of_when_the_relay_has_been_there_for_a_while() -> None:
+    play = Play(12)
+    play.site.subscribe("/other")
+    play.robot.disk = SimDisk()
+    play.kill_both()
+    play.world.run(10.0)
+    assert len(play.robot.channel.retained) > 50
+    play.world.run(60.0)
+    assert len(play.robot.channel.retained) < 5
