@@ -375,14 +375,14 @@ class SimPool:
 class SimHub:
     """A relay core as a node."""
 
-    def __init__(self, world: "World", *, boot: int) -> None:
+    def __init__(self, world: "World", *, boot: int, name: str = "relay") -> None:
         self.world = world
         self.clock = world.relay_clock
         self.refusals: list[tuple[str, str]] = []
         self.client_keys: list[tuple[ClientName, ClientKeys]] = []
         self.fed: list[Message] = []
         self.hub = Hub(
-            name=ClientName("relay"),
+            name=ClientName(name),
             boot=boot,
             access=world.access,
             known=lambda _name: True,
@@ -411,6 +411,15 @@ class SimHub:
             self._sides.append((inner, port))
         return port
 
+    def peer_port(self, relay: str) -> ClockedPort:
+        """The end of the hop to another relay."""
+        inner = self.hub.add_peer(ClientName(relay))
+        port = self.sides.get(inner.client)
+        if port is None:
+            port = self.sides[inner.client] = ClockedPort(inner, self.clock)
+            self._sides.append((inner, port))
+        return port
+
     def ports(self) -> list[Port]:
         return [*self.sides.values(), *self.more_ports]
 
@@ -433,6 +442,10 @@ class SimHub:
     def client_up(self, client: ClientName, *, resumed: bool) -> None: ...
 
     def client_down(self, client: ClientName, reason: str) -> None: ...
+
+    def peer_up(self, peer: ClientName) -> None: ...
+
+    def peer_down(self, peer: ClientName, reason: str) -> None: ...
 
     def stream_added(self, stream: StreamInfo) -> None: ...
 

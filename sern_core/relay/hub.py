@@ -229,7 +229,7 @@ class Hub:
             self.received.tidy({identity.topic for identity in self.relayed}, now=now)
             self._numbering.tidy(now=now)
         self.matching.sweep(now=now)
-        for client in self.streams.fanout.origins():  # those who read on when it is due have done so
+        for client in self.streams.fanout.announcers():  # those who read on when it is due have done so
             link = self.links[client]
             if link.reading.due_s is None:
                 link.reassembly.work_us = 0
@@ -461,6 +461,9 @@ class Hub:
         """What a client subscribed to it gets; a peer says who gets it behind it, and the origin is to know."""
         if is_peer(link.peer):
             self.streams.refresh_interest([channel.stream.id], now=now)
+            asking = self.peers.answered(link, channel)
+            if asking is not None:
+                self.matching.ask(link.peer, asking, now=now)
 
     def on_definition(self, link: Link, digest: str, *, now: float) -> None:
         link.reassembly.work_us += len(self.links) + len(self.relayed) // STREAMS_PER_US
@@ -534,6 +537,8 @@ class Hub:
         # What is a name and no pattern is denied by name: that gives nothing away about what there is.
         names = {TopicName(part) for part in parts if name_problem(part) is None}
         patterns = [part for part in parts if part not in names]
+        if is_peer(client):
+            names |= self.peers.asks(client, parts)
         try:
             self.streams.apply(self.routing.subscribe(client, patterns, exact=names), now)
             if self.streams.draining.has(client):
@@ -573,8 +578,8 @@ class Hub:
                 assert link.outgoing.by_stream.get(identity) is channel, (
                     f"{identity.topic}: a closed channel to {client}"
                 )
-        for origin in self.streams.fanout.origins():
-            assert origin in self.links, f"streams of {origin}, who is gone, are to be told of"
+        for announcer in self.streams.fanout.announcers():
+            assert announcer in self.links, f"streams of {announcer}, who is gone, are to be told of"
         taken: dict[ClientName, Counter[ClientName]] = defaultdict(Counter)
         for identity, relayed in self.relayed.items():
             for client in relayed.outs if identity.origin not in self.local_owners else ():

@@ -19,7 +19,8 @@ Ending = tuple[Link, OutChannel]
 
 
 class Fanout:
-    """Streams that some subscribers are still to be told of, by origin. Who they are is in `Relayed.waiting`, and only
+    """Streams that some subscribers are still to be told of, by who announced them: a client its own, another relay those
+    of its clients. Who they are is in `Relayed.waiting`, and only
     there: whoever leaves, or wants the stream no more, is taken out of it.
 
     `offer` opens a channel, in place of the one there may be; `told` is called after the last subscriber of a stream;
@@ -35,15 +36,29 @@ class Fanout:
         self._offer = offer
         self._told = told
         self._end = end
-        self._ending: dict[ClientName, dict[StreamId, dict[ClientName, Ending]]] = {}  # by origin
-        self._by_origin: dict[ClientName, dict[StreamId, Relayed]] = {}
+        self._ending: dict[ClientName, dict[StreamId, dict[ClientName, Ending]]] = {}  # by who announced it
+        self._beginning: dict[ClientName, dict[StreamId, Relayed]] = {}
+        self._ended_by: dict[StreamId, ClientName] = {}  # whose `_ending` a stream is in
+        self._begun_by: dict[StreamId, ClientName] = {}  # and whose `_beginning`
 
-    def begin(self, relayed: Relayed, clients: Sequence[ClientName]) -> None:
-        """These subscribers are to be told of the stream; `go_on` does it."""
+    def begin(self, relayed: Relayed, clients: Sequence[ClientName], announcer: ClientName) -> None:
+        """These subscribers are to be told of the stream; `go_on` for the announcer's link does it."""
         if clients:
-            relayed.waiting.update(dict.fromkeys(clients))
             identity = relayed.stream.stream.id
-            self._by_origin.setdefault(identity.origin, {})[identity] = relayed
+            if self._begun_by.get(identity, announcer) != announcer:
+                self._drop(identity)
+            relayed.waiting.update(dict.fromkeys(clients))
+            self._beginning.setdefault(announcer, {})[identity] = relayed
+            self._begun_by[identity] = announcer
+
+    def _drop(self, identity: StreamId) -> None:
+        """The stream has no turn any more."""
+        announcer = self._begun_by.pop(identity, None)
+        if announcer is not None:
+            streams = self._beginning[announcer]
+            del streams[identity]
+            if not streams:
+                del self._beginning[announcer]
 
     def go_on(self, link: Link, *, now: float) -> bool:
         """One slice for the streams of a peer, as far as its account allows. True: nobody waits any more."""
@@ -55,8 +70,7 @@ class Fanout:
             reassembly.work_us += limits.close_us
             identity, outs = next(iter(ending.items()))
             self.close(next(iter(outs)), identity, now=now)
-        streams = self._by_origin.get(link.peer)
-        while streams:
+        while streams := self._beginning.get(link.peer):
             identity, relayed = next(iter(streams.items()))
             while relayed.waiting:
                 if reassembly.work_us > reassembly.slice_us:
@@ -65,51 +79,48 @@ class Fanout:
                 client = next(iter(relayed.waiting))
                 del relayed.waiting[client]
                 self._offer(client, identity, now)
-            del streams[identity]
+            self._drop(identity)
             self._told(relayed, now)
-        self._by_origin.pop(link.peer, None)
         return True
 
-    def close_later(self, relayed: Relayed) -> None:
-        """The stream has ended: its channels are closed in their turn, before anything that begins after it."""
+    def close_later(self, relayed: Relayed, announcer: ClientName) -> None:
+        """The stream has ended, as who announced it says: its channels are closed in their turn, before anything that
+        begins after it."""
         identity = relayed.stream.stream.id
         if relayed.outs:
-            self._ending.setdefault(identity.origin, {}).setdefault(identity, {}).update(relayed.outs)
+            announcer = self._ended_by.setdefault(identity, announcer)
+            self._ending.setdefault(announcer, {}).setdefault(identity, {}).update(relayed.outs)
 
     def close(self, client: ClientName, identity: StreamId, *, now: float) -> None:
         """Close the channel of an ended stream now, if it waits for that."""
-        ending = self._ending.get(identity.origin)
-        if ending is None or identity not in ending:
+        announcer = self._ended_by.get(identity)
+        if announcer is None:
             return
+        ending = self._ending[announcer]
         pair = ending[identity].pop(client, None)
         if not ending[identity]:
-            del ending[identity]
+            del ending[identity], self._ended_by[identity]
             if not ending:
-                del self._ending[identity.origin]
+                del self._ending[announcer]
         if pair is None:
             return
         link, channel = pair
         if link.sender.channels.get(channel.channel_id) is channel:  # else the client has gone meanwhile
             self._end(client, link, channel, now)
 
-    def forget(self, origin: ClientName, *, now: float) -> None:
-        """The origin is gone for good, and nothing more is read from it: close now what waits."""
-        for identity, outs in list(self._ending.get(origin, {}).items()):
+    def forget(self, announcer: ClientName, *, now: float) -> None:
+        """It is gone for good, and nothing more is read from it: close now what waits."""
+        for identity, outs in list(self._ending.get(announcer, {}).items()):
             for client in list(outs):
                 self.close(client, identity, now=now)
 
     def end(self, relayed: Relayed) -> None:
         """The stream has ended: nobody is told of it any more."""
         relayed.waiting.clear()
-        identity = relayed.stream.stream.id
-        streams = self._by_origin.get(identity.origin, {})
-        if streams.get(identity) is relayed:
-            del streams[identity]
-            if not streams:
-                del self._by_origin[identity.origin]
+        self._drop(relayed.stream.stream.id)
 
-    def origins(self) -> list[ClientName]:
-        return list(self._by_origin | self._ending)
+    def announcers(self) -> list[ClientName]:
+        return list(self._beginning | self._ending)
 
     def closing(self) -> set[int]:
         """The identities of channels that wait to be closed; for tests."""
@@ -118,5 +129,4 @@ class Fanout:
 
     def holds(self, relayed: Relayed) -> bool:
         """Whether the stream has a turn; for tests."""
-        identity = relayed.stream.stream.id
-        return self._by_origin.get(identity.origin, {}).get(identity) is relayed
+        return relayed.stream.stream.id in self._begun_by

@@ -16,9 +16,10 @@ from typing import Final, NamedTuple
 from sern_core.link.link import Link
 from sern_core.relay.clients import Clients
 from sern_core.relay.routing import RoutingTable
+from sern_core.stream.out_channel import OutChannel
 from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.names import is_client_name
-from sern_core.vocabulary.types import ClientName
+from sern_core.vocabulary.types import ClientName, TopicName
 from sern_core.wire import framing
 from sern_core.wire.announce import MAX_STRINGS
 
@@ -61,6 +62,8 @@ class Peers:
         self._changed = changed
         self._homes: dict[ClientName, Home] = {}
         self._asked: dict[ClientName, tuple[str, ...]] = {}  # what a peer was asked for in its session
+        self._asking: dict[ClientName, list[str]] = {}  # what a peer asks for
+        self._owed: dict[ClientName, set[TopicName]] = {}  # topics that a peer gets beside that
 
     # --- peers ------------------------------------------------------------------------------------------------------
 
@@ -79,7 +82,8 @@ class Peers:
 
     def lost(self, peer: ClientName, *, now: float) -> None:
         """A peer has stayed away for too long: who was there is nowhere."""
-        self._asked.pop(peer, None)
+        for table in (self._asked, self._asking, self._owed):
+            table.pop(peer, None)
         self._leave(peer, now)
 
     def _leave(self, peer: ClientName, now: float) -> None:
@@ -136,6 +140,27 @@ class Peers:
         for start in range(0, len(homes), MAX_HOMES):
             told = [list(home) for home in homes[start : start + MAX_HOMES]]
             self._attempt(link, {"t": "here", "clients": told}, now)
+
+    # --- what a peer asks for ---------------------------------------------------------------------------------------
+
+    def asks(self, peer: ClientName, parts: list[str]) -> set[TopicName]:
+        """A peer asks for these patterns and names. Returns topics that it gets as well: those that it was to deliver
+        to clients which may not have come back yet, if it was started anew. It takes note of them from the
+        announcements, and answers for whom they are."""
+        self._asking[peer] = parts
+        link = self._clients.links.get(peer)
+        channels = [] if link is None else link.sender.channels.values()
+        owed = self._owed[peer] = {channel.stream.id.topic for channel in channels if channel.required}
+        return owed
+
+    def answered(self, link: Link, channel: OutChannel) -> list[str] | None:
+        """A peer has said for whom a stream is. Returns what it asks for, if the stream was owed and is not any more."""
+        topic = channel.stream.id.topic
+        owed = self._owed.get(link.peer, set())
+        if channel.required or topic not in owed:
+            return None
+        owed.discard(topic)
+        return self._asking.get(link.peer)
 
     # --- what is asked for ------------------------------------------------------------------------------------------
 

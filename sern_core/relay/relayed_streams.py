@@ -168,7 +168,7 @@ class RelayedStreams:
         for client in relayed.outs:
             self._presence.parted(identity.origin, client)
         if source is not None and drain:
-            self.fanout.close_later(relayed)
+            self.fanout.close_later(relayed, source.peer)
         else:
             for client, (link, channel) in relayed.outs.items():
                 if drain:
@@ -213,7 +213,7 @@ class RelayedStreams:
 
     def _offer_all(self, identity: StreamId, clients: Sequence[ClientName], source: Link | None, now: float) -> None:
         if source is not None:
-            self.fanout.begin(self.by_id[identity], clients)
+            self.fanout.begin(self.by_id[identity], clients, source.peer)
             return
         for client in clients:
             self.offer(client, identity, now)
