@@ -13,6 +13,48 @@ from sern_sim.ports import Port
 from tests.world import Clock, SimClient, SimHub, World
 
 
+class RoamingPort:
+    """A client's end of its hop to one relay of several. Only the one that it is `at` leads to it."""
+
+    def __init__(self, client: SimClient, at: dict[str, str], relay: str) -> None:
+        self._client = client
+        self._at = at
+        self._relay = relay
+        self.reached = False
+
+    @property
+    def here(self) -> bool:
+        return self._at[self._client.name] == self._relay
+
+    @property
+    def dirty(self) -> bool:
+        return self.here and self._client.port.dirty
+
+    def receive(self, data: bytes, *, now: float) -> None:
+        if self.here:
+            self._client.port.receive(data, now=now)
+
+    def next_datagram(self, *, now: float) -> bytes | None:
+        return self._client.port.next_datagram(now=now) if self.here else None
+
+    def next_deadline(self) -> float | None:
+        return self._client.port.next_deadline() if self.here else None
+
+    def handle_timeout(self, *, now: float) -> None:
+        if self.here:
+            self._client.port.handle_timeout(now=now)
+
+    def connected(self, *, now: float) -> None:
+        self.reached = True
+        if self.here:
+            self._client.port.connected(now=now)
+
+    def disconnected(self, *, now: float) -> None:
+        self.reached = False
+        if self.here:
+            self._client.port.disconnected(now=now)
+
+
 class FabricWorld(World):
     """`relays` by name. The relay of a plain world is none of them. `between`: what carries datagrams from one to
     another."""
@@ -22,6 +64,7 @@ class FabricWorld(World):
         self.relays = {name: SimHub(self, boot=self._boot(), name=name) for name in relays}
         self.at: dict[str, str] = {}
         """The relay of each client."""
+        self.roaming: dict[tuple[str, str], RoamingPort] = {}
         for one, other in combinations(sorted(self.relays), 2):
             a, b = self.relays[one], self.relays[other]
             model = between or LinkModel(delay_s=0.01).as_stream()
@@ -44,15 +87,30 @@ class FabricWorld(World):
     def client_at(
         self, relay: str, name: str, link: LinkModel | None = None, *, patterns: Iterable[str] = ()
     ) -> SimClient:
-        """A client that connects to that relay now."""
+        """A client that connects to that relay now, and may move to the others."""
         client = self._process(name, Clock(), SchedulerParams(), patterns)
-        hub = self.relays[relay]
         wire = link or LinkModel().as_stream()
-        self.hops[name] = self.network.join(
-            client.port, client, hub.port(client.name), hub, wire, wire, name=f"{name}-{relay}"
-        )
         self.at[name] = relay
+        client.more_ports = []
+        for other, hub in self.relays.items():
+            port = self.roaming[name, other] = RoamingPort(client, self.at, other)
+            client.more_ports.append(port)
+            self.hops[f"{name}-{other}"] = self.network.join(
+                port, client, hub.port(client.name), hub, wire, wire, name=f"{name}-{other}"
+            )
         return client
+
+    def move(self, name: str, relay: str) -> None:
+        """The client goes over to another relay, as one does whose relay does not answer."""
+        old, new = self.roaming[name, self.at[name]], self.roaming[name, relay]
+        now = self.now
+        if old is new:
+            return
+        if old.reached:
+            self.clients[name].port.disconnected(now=now)
+        self.at[name] = relay
+        if new.reached:
+            self.clients[name].port.connected(now=now)
 
     def restart(self, name: str) -> None:
         """kill -9 of a relay: a new process in its place that knows nothing."""
@@ -72,6 +130,20 @@ class FabricWorld(World):
         super().validate()
         for relay in self.relays.values():
             relay.hub.validate()
+
+    def homes(self, name: str) -> list[str]:
+        """The relays at which a client has a session."""
+        client = ClientName(name)
+        links = {relay: hub.hub.links.get(client) for relay, hub in self.relays.items()}
+        return [relay for relay, link in links.items() if link is not None and link.established]
+
+    def settled(self) -> bool:
+        """Everybody is connected, and nothing of a reliable stream waits anywhere, also for nobody."""
+        if not self.peers_up() or any(self.homes(name) != [relay] for name, relay in self.at.items()):
+            return False
+        return not any(
+            channel.retained for link in self.links() for channel in link.sender.channels.values() if channel.reliable
+        )
 
     def peers_up(self) -> bool:
         return all(

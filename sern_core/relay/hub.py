@@ -136,6 +136,7 @@ class Hub:
             wall_ns=wall_ns,
             ended=self._own_ended,
             limits=link.limits,
+            home=self.peers.home,
             now=now,
         )
         self.relayed = streams.by_id
@@ -461,6 +462,7 @@ class Hub:
         """What a client subscribed to it gets; a peer says who gets it behind it, and the origin is to know."""
         if is_peer(link.peer):
             self.streams.refresh_interest([channel.stream.id], now=now)
+            self.streams.moved_to(link, channel, now)
             asking = self.peers.answered(link, channel)
             if asking is not None:
                 self.matching.ask(link.peer, asking, now=now)
@@ -508,6 +510,11 @@ class Hub:
             self.peers.told(link.peer, envelope, now=now)
         elif kind == "left":
             self.peers.told_left(link.peer, envelope, now=now)
+        elif kind == "released":
+            client = ClientName(framing.take_str(envelope, "client", max_length=64))
+            topic = TopicName(framing.take_str(envelope, "topic"))
+            if self.peers.home(client) is not None and client in self.links:
+                self.streams.released(client, topic, now, whole=framing.take_bool(envelope, "whole"))
         elif kind == "denied":
             code = framing.take_str(envelope, "code", max_length=64)
             self.events.refused(link.peer, code, framing.take_str(envelope, "why"))

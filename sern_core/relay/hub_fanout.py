@@ -19,8 +19,8 @@ Ending = tuple[Link, OutChannel]
 
 
 class Fanout:
-    """Streams that some subscribers are still to be told of, by who announced them: a client its own, another relay those
-    of its clients. Who they are is in `Relayed.waiting`, and only
+    """Streams that some subscribers are still to be told of, by who announced them: a client its own, another relay
+    those of its clients. Who they are is in `Relayed.waiting`, and only
     there: whoever leaves, or wants the stream no more, is taken out of it.
 
     `offer` opens a channel, in place of the one there may be; `told` is called after the last subscriber of a stream;

@@ -20,7 +20,7 @@ from sern_core.vocabulary.errors import RefusedError, UsageError, WireError
 from sern_core.vocabulary.limits import PeerLimits
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo
 from sern_core.vocabulary.names import is_peer
-from sern_core.vocabulary.types import ClientName, DropReason
+from sern_core.vocabulary.types import ClientName, DropReason, TopicName
 from sern_core.wire.announce import check_onwards
 
 STREAM_US: Final = 50
@@ -34,7 +34,7 @@ MAX_DENIED: Final = 64
 
 
 class RelayedStreams:
-    """`ended` is told of the end of a stream of the relay's own."""
+    """`ended` is told of the end of a stream of the relay's own; `home` names the peer that a client is at."""
 
     def __init__(
         self,
@@ -48,6 +48,7 @@ class RelayedStreams:
         wall_ns: Callable[[float], int],
         ended: Callable[[Relayed, float], None],
         limits: PeerLimits,
+        home: Callable[[ClientName], ClientName | None],
         now: float,
     ) -> None:
         self._clients = clients
@@ -57,6 +58,7 @@ class RelayedStreams:
         self._events = events
         self._wall_ns = wall_ns
         self._ended = ended
+        self._home = home
         routing.route_units = self._replay_units
         self.by_id: dict[StreamId, Relayed] = {}
         self.replays = ReplayStore(cache_bytes)
@@ -236,6 +238,9 @@ class RelayedStreams:
             relayed.outs[client] = ended
             self._presence.joined(identity.origin, client)
             return
+        held = self._held_for(relayed, client) if is_peer(client) else None
+        if held is not None:
+            first = min(first, held.watermark + 1)
         try:
             replays = self.latched(link, relayed, first, now)
             channel = link.outgoing.open(stream, first=first, now=now, replays=replays)
@@ -250,6 +255,8 @@ class RelayedStreams:
         else:
             relayed.outs[client] = (link, channel)
             self._presence.joined(identity.origin, client)
+            if held is not None:
+                self._go_on_with(held, link, channel, now)
 
     def _close(self, client: ClientName, identity: StreamId, reason: DropReason, now: float) -> None:
         relayed = self.by_id.get(identity)
@@ -277,32 +284,67 @@ class RelayedStreams:
         else:
             self.draining.add(client, link, channel, max_bytes=self._clients.max_queue_bytes(client), now=now)
 
+    # --- to peers -------------------------------------------------------------------------------------------------
+
     def hand_over(self, client: ClientName, peer: ClientName, now: float) -> None:
-        """The client is at a peer: that gets the streams in its place, from what the client has not confirmed."""
+        """The client is at a peer: that gets the streams of this relay's own clients in its place, from what the client
+        has not confirmed. What came from another relay is kept until that one has seen to it (`released`)."""
+        kept: list[TopicName] = []
         for identity in self._routing.received_by(client):
             relayed = self.by_id[identity]
-            pair = relayed.outs.get(client)
-            if pair is None or not pair[1].reliable or not self._routing.offers(peer, identity):
+            if client not in relayed.outs or not relayed.outs[client][1].reliable:
                 continue
-            held = pair[1]
-            if peer not in relayed.outs:
-                first = min(held.watermark + 1, relayed.stream.delivered + 1)
-                self._clients.link(peer, now)
-                change = self._routing.also(peer, identity.topic)
-                others = tuple(match for match in change.matched if match.stream != identity)
-                self.apply(RouteChange(matched=others), now)
-                self.offer(peer, identity, now, first=first)
-                taken = relayed.outs.get(peer)
-                if taken is not None:
-                    for out in list(held.retained):
-                        if out.seq >= taken[1].next_seq and not out.message.replay:
-                            if out.seq > taken[1].next_seq:
-                                taken[0].outgoing.skip(taken[1], out.seq, now=now)
-                            taken[0].sender.submit(taken[1], out.message, now=now, forced=True)
-                self._close(client, identity, DropReason.UNWANTED, now)
-            else:  # what the peer has had already for others does not come to it again
+            if not self._routing.offers(peer, identity):
+                kept.append(identity.topic)
+            elif peer in relayed.outs:
                 self._close(client, identity, DropReason.DISCONNECTED, now)
-        self.apply(self._routing.subscribe(client), now)
+            else:
+                self._clients.link(peer, now)
+                self.apply(self._routing.also(peer, identity.topic), now)
+                self._close(client, identity, DropReason.UNWANTED, now)
+        self.apply(self._routing.subscribe(client, exact=kept), now)
+
+    def released(self, client: ClientName, topic: TopicName, now: float, *, whole: bool) -> None:
+        """Who has the stream sees to it that the client gets it at its peer: all of it, or not what is held here."""
+        for identity in self._routing.received_by(client):
+            if identity.topic == topic and self._routing.via(identity) is not None:
+                self._close(client, identity, DropReason.UNWANTED if whole else DropReason.DISCONNECTED, now)
+        left = {identity.topic for identity in self._routing.received_by(client)} - {topic}
+        self.apply(self._routing.subscribe(client, exact=left), now)
+
+    def _held_for(self, relayed: Relayed, peer: ClientName) -> OutChannel | None:
+        """The channel with what a client has not confirmed that is at a peer by now; None: there is none."""
+        held: OutChannel | None = None
+        for name, (_link, channel) in relayed.outs.items():
+            behind = map(ClientName, channel.required) if is_peer(name) else (name,)
+            moved = [client for client in behind if name != peer and self._home(client) == peer]
+            if channel.reliable and moved and (held is None or channel.watermark < held.watermark):
+                held = channel
+                relayed.handed |= {(peer, client) for client in moved}
+        return held
+
+    def _go_on_with(self, held: OutChannel, link: Link, channel: OutChannel, now: float) -> None:
+        for out in list(held.retained):
+            if out.message.replay or out.seq < channel.next_seq:
+                continue
+            if out.seq > channel.next_seq:
+                link.outgoing.skip(channel, out.seq, now=now)
+            link.sender.submit(channel, out.message, now=now, forced=True)
+
+    def moved_to(self, link: Link, channel: OutChannel, now: float) -> None:
+        """A peer has said for whom a stream is: where these were before, nobody needs to keep it for them any more."""
+        relayed = self.by_id.get(channel.stream.id)
+        if relayed is None or not channel.reliable:
+            return
+        for name in map(ClientName, channel.required):
+            if self._home(name) != link.peer:
+                continue
+            for other, (_link, held) in relayed.outs.items():
+                if other != link.peer and is_peer(other) and name in held.required:
+                    whole = (link.peer, name) in relayed.handed
+                    said = {"t": "released", "client": name, "topic": channel.stream.id.topic, "whole": whole}
+                    self._clients.tell(other, said, now)
+            relayed.handed.discard((link.peer, name))
 
     def prime(self, link: Link, now: float) -> None:
         """The client is another process than before: it gets what is latched of all that it takes."""

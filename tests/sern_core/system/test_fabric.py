@@ -1,9 +1,12 @@
 """Several relays: what works through one works through two and three."""
 
+from random import Random
+
 import pytest
 
 from sern_core.vocabulary.types import PriorityClass
 from sern_sim.models import LinkModel, Window
+from tests.exploring import cases
 from tests.fabric_world import FabricWorld
 from tests.world import spec
 
@@ -97,3 +100,37 @@ def test_what_a_site_has_not_confirmed_is_kept_while_it_is_away() -> None:
     stop()
     world.until(world.quiet, within_s=60.0, what="everything has arrived")
     assert [got.seq for got in site.on("/robot/log")] == list(range(1, len(robot.sent) + 1))
+
+
+@pytest.mark.parametrize("seed", range(cases(20)))
+def test_whatever_dies_parts_or_moves_a_reliable_stream_is_whole_or_what_is_missing_is_reported(seed: int) -> None:
+    world = FabricWorld(["a", "b", "c"], seed).watch(0.25)
+    rng = Random(seed)
+    robot = world.client_at("a", "robot", THIN)
+    site = world.client_at("b", "site", THIN, patterns=["/robot/.*"])
+    beside = world.client_at("c", "beside", THIN, patterns=["/robot/log"])
+    log = robot.publish("/robot/log", spec(reliable=True, depth=1000))
+    world.run(3.0)
+    stop = robot.every(0.1, log, bytes(50))
+
+    def restart() -> None:
+        world.restart(rng.choice("abc"))
+
+    def part() -> None:
+        world.hops[rng.choice(("a-b", "a-c", "b-c"))].break_connection(reconnect_s=rng.choice((0.5, 3.0)))
+
+    def move() -> None:
+        world.move(rng.choice(("robot", "site", "beside")), rng.choice("abc"))
+
+    for _ in range(rng.randint(2, 6)):
+        world.run(rng.choice((0.05, 0.5, 2.0, 5.0)))
+        rng.choice((restart, part, move))()
+    world.run(3.0)
+    stop()
+    world.until(world.settled, within_s=900.0, what="everything has arrived or is given up")
+    for client in (site, beside):
+        seqs = [got.seq for got in client.on("/robot/log")]
+        assert seqs == sorted(set(seqs)), "twice, or out of order"
+        missing = set(range(1, len(robot.sent) + 1)) - set(seqs)
+        reported = {dropped.seq for dropped in robot.dropped_out}
+        assert missing <= reported, f"{client.name} lacks {sorted(missing - reported)}, and nobody says so"
