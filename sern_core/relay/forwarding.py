@@ -104,6 +104,8 @@ class Forwarding:
             except Exception as error:  # noqa: BLE001  (of that client's link: the others get theirs)
                 self._not_taken(relayed, out_link, channel, message, error, now)
             behind = behind or channel.watermark >= message.seq
+        if stream.reliable:
+            self._streams.moves.message(stream.stream.id, message)
         if stream.stream.spec.durable:
             self.hold(relayed, message, now)
         if not message.drop_marker and (message.seq > relayed.kept_seq or relayed.source is None):

@@ -42,7 +42,7 @@ from sern_core.stream.out_channel import OutChannel
 from sern_core.stream.out_message import OutMessage
 from sern_core.vocabulary.errors import RefusedError, WireError
 from sern_core.vocabulary.key_news import ClientKeys, RelayKeys
-from sern_core.vocabulary.message import Message
+from sern_core.vocabulary.message import Message, StreamId
 from sern_core.vocabulary.names import is_client_name, is_peer, name_problem, peer_name
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
 from sern_core.vocabulary.types import ClientName, DropReason, TopicName
@@ -137,6 +137,7 @@ class Hub:
             ended=self._own_ended,
             limits=link.limits,
             home=self.peers.home,
+            moved=self.peers.moved,
             now=now,
         )
         self.relayed = streams.by_id
@@ -223,6 +224,7 @@ class Hub:
         self.clients.sweep_orphans(now)
         self.streams.draining.sweep(now=now)
         self.streams.sweep(now)
+        self.streams.moves.sweep(now=now)
         self.holding.look(now=now)
         self.clients.sweep(now)
         if now >= self._tidy_due_s:
@@ -297,10 +299,21 @@ class Hub:
         """A client has come to a peer, or left it. What is held for it here goes there."""
         self.presence.changed(client, now=now)
         peer = self.peers.home(client)
+        if peer is not None:
+            self._from_peer(client, peer, now)
         if peer is not None and client in self.links:
             self.absent.forget(client)
             self.matching.forget(client)
-            self.streams.hand_over(client, peer, now)
+            self.streams.moves.went(client, peer, now=now)
+
+    def _from_peer(self, client: ClientName, peer: ClientName, now: float) -> None:
+        """Streams of the client that the peer has announced all along come from there now."""
+        link = self.links.get(peer)
+        for identity in self.routing.streams_of(client) if link is not None else ():
+            stream, relayed = link.taking.streams.get(identity), self.relayed[identity]
+            if stream is not None and stream.channel_id is not None and relayed.source is not link:
+                self.streams.take(link, stream, now).source = link
+                self.streams.answer(relayed, now)
 
     def revoke(self, access: AccessTable, *, now: float) -> None:
         """New access rules: what they no longer allow ends now."""
@@ -408,6 +421,7 @@ class Hub:
             relayed.source = None  # one answer for all who are absent
             self.absent.hold(announcement.required, identity, link, now)
         relayed.source = link
+        self.streams.moves.came_again(relayed)
         self.streams.answer(relayed, now)
         return None
 
@@ -416,6 +430,8 @@ class Hub:
         relayed = self.relayed.get(identity)
         if relayed is not None and relayed.source is not link and (is_peer(link.peer) or self.routing.via(identity)):
             return  # it comes from elsewhere by now
+        if is_peer(link.peer) and not self.streams.moves.ends_for_good(identity):
+            return
         if identity.topic != OBJECTS_TOPIC:
             self.streams.retract(link, stream, now)
 
@@ -462,7 +478,7 @@ class Hub:
         """What a client subscribed to it gets; a peer says who gets it behind it, and the origin is to know."""
         if is_peer(link.peer):
             self.streams.refresh_interest([channel.stream.id], now=now)
-            self.streams.moved_to(link, channel, now)
+            self.streams.moves.named(link, channel, now=now)
             asking = self.peers.answered(link, channel)
             if asking is not None:
                 self.matching.ask(link.peer, asking, now=now)
@@ -510,11 +526,17 @@ class Hub:
             self.peers.told(link.peer, envelope, now=now)
         elif kind == "left":
             self.peers.told_left(link.peer, envelope, now=now)
-        elif kind == "released":
+        elif kind == "again":
+            origin, boot = framing.take_str(envelope, "origin", max_length=64), framing.take_int(envelope, "boot")
+            topic = framing.take_str(envelope, "topic")
+            self.streams.moves.expect_again(StreamId(ClientName(origin), boot, TopicName(topic)))
+        elif kind in ("go", "released"):
             client = ClientName(framing.take_str(envelope, "client", max_length=64))
-            topic = TopicName(framing.take_str(envelope, "topic"))
-            if self.peers.home(client) is not None and client in self.links:
-                self.streams.released(client, topic, now, whole=framing.take_bool(envelope, "whole"))
+            topic = framing.take_str(envelope, "topic")
+            if kind == "go":
+                self.streams.moves.go(client, TopicName(topic), now=now)
+            elif self.peers.home(client) is not None and client in self.links:
+                self.streams.moves.released(client, TopicName(topic), now=now)
         elif kind == "denied":
             code = framing.take_str(envelope, "code", max_length=64)
             self.events.refused(link.peer, code, framing.take_str(envelope, "why"))
@@ -572,6 +594,7 @@ class Hub:
         for identity, relayed in self.relayed.items():
             outs = set(self.routing.subscribers(identity))
             held = set(relayed.outs) | relayed.unopened | relayed.waiting.keys()
+            held |= set(self.streams.moves.waiting(identity))
             assert not relayed.waiting or self.streams.fanout.holds(relayed), (
                 f"{identity.topic}: some are never told of it"
             )
@@ -604,3 +627,4 @@ class Hub:
                 assert id(channel) in held_channels, f"{channel.stream.id.topic}: nobody's channel to {client}"
         self.absent.validate(self.links)
         self.peers.validate()
+        self.streams.moves.validate()

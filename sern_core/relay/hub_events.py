@@ -114,7 +114,7 @@ class GuardedEvents:
 class Relayed:
     """One stream at the relay: where it comes from (None: the relay itself), where it goes, what is kept of it."""
 
-    __slots__ = ("cache", "handed", "kept_seq", "outs", "source", "stream", "unopened", "waiting")
+    __slots__ = ("cache", "kept_seq", "outs", "source", "stream", "unopened", "waiting")
 
     def __init__(self, source: Link | None, stream: InStream, replays: ReplayStore) -> None:
         self.source = source
@@ -122,8 +122,6 @@ class Relayed:
         self.outs: dict[ClientName, tuple[Link, OutChannel]] = {}
         self.waiting: dict[ClientName, None] = {}  # subscribers that are still to be told of it, in their order
         self.unopened: set[ClientName] = set()  # subscribers towards whom no channel could be opened; they were told
-        self.handed: set[tuple[ClientName, ClientName]] = set()
-        """Peers that have got what others, or this relay, held for a client: peer and client."""
         self.kept_seq = 0  # of the newest message that was looked at for what the relay keeps
         self.cache: LatchedCache | None = None
         self.keep_latched(replays)

@@ -25,6 +25,8 @@ from sern_core.wire.announce import MAX_STRINGS
 
 MAX_HOMES: Final = 40
 """Clients in one message: an envelope holds 4 KiB."""
+MOVED_S: Final = 10.0
+"""For so long a client that has come from a peer may lack what was held for it there."""
 MAX_EPOCH: Final = 2**62
 
 
@@ -61,6 +63,7 @@ class Peers:
         self._displaced = displaced
         self._changed = changed
         self._homes: dict[ClientName, Home] = {}
+        self._came_s: dict[ClientName, float] = {}  # when a client came from a peer
         self._asked: dict[ClientName, tuple[str, ...]] = {}  # what a peer was asked for in its session
         self._asking: dict[ClientName, list[str]] = {}  # what a peer asks for
         self._owed: dict[ClientName, set[TopicName]] = {}  # topics that a peer gets beside that
@@ -101,9 +104,18 @@ class Peers:
     def came(self, client: ClientName, *, now: float) -> None:
         """A client has begun a session here."""
         known = self._homes.get(client)
+        if known is not None and known.peer is not None:
+            self._came_s[client] = now
         home = self._homes[client] = Home(1 if known is None else known.epoch + 1, None)
         for link in self._links():
             self._say(link, [(client, home.epoch)], now)
+
+    def moved(self, client: ClientName, now: float) -> bool:
+        """Whether a client has come here from a peer just now."""
+        came_s = self._came_s.get(client)
+        if came_s is not None and now > came_s + MOVED_S:
+            del self._came_s[client]
+        return client in self._came_s
 
     def left(self, client: ClientName, *, now: float) -> None:
         """A client is given up here."""
@@ -111,6 +123,7 @@ class Peers:
         if home is None or home.peer is not None:
             return
         del self._homes[client]
+        self._came_s.pop(client, None)
         for link in self._links():
             self._attempt(link, {"t": "left", "clients": [client]}, now)
 

@@ -11,6 +11,7 @@ from sern_core.relay.clients import Clients
 from sern_core.relay.draining import Draining
 from sern_core.relay.hub_events import GuardedEvents, Relayed
 from sern_core.relay.hub_fanout import Fanout
+from sern_core.relay.moves import Moves
 from sern_core.relay.presence import Presence
 from sern_core.relay.routing import UNIT_S, RouteChange, RoutingTable
 from sern_core.stream.in_stream import InStream
@@ -20,7 +21,7 @@ from sern_core.vocabulary.errors import RefusedError, UsageError, WireError
 from sern_core.vocabulary.limits import PeerLimits
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo
 from sern_core.vocabulary.names import is_peer
-from sern_core.vocabulary.types import ClientName, DropReason, TopicName
+from sern_core.vocabulary.types import ClientName, DropReason
 from sern_core.wire.announce import check_onwards
 
 STREAM_US: Final = 50
@@ -34,7 +35,7 @@ MAX_DENIED: Final = 64
 
 
 class RelayedStreams:
-    """`ended` is told of the end of a stream of the relay's own; `home` names the peer that a client is at."""
+    """`ended` is told of the end of a stream of the relay's own; `home` and `moved` are of `Moves`."""
 
     def __init__(
         self,
@@ -49,6 +50,7 @@ class RelayedStreams:
         ended: Callable[[Relayed, float], None],
         limits: PeerLimits,
         home: Callable[[ClientName], ClientName | None],
+        moved: Callable[[ClientName, float], bool],
         now: float,
     ) -> None:
         self._clients = clients
@@ -58,7 +60,7 @@ class RelayedStreams:
         self._events = events
         self._wall_ns = wall_ns
         self._ended = ended
-        self._home = home
+        self.moves = Moves(clients, routing, self, home=home, moved=moved)
         routing.route_units = self._replay_units
         self.by_id: dict[StreamId, Relayed] = {}
         self.replays = ReplayStore(cache_bytes)
@@ -94,6 +96,7 @@ class RelayedStreams:
             refused = self.by_id.pop(identity, None)
             if refused is not None:
                 self.fanout.end(refused)
+                self.moves.ended(identity)
                 if refused.cache is not None:
                     self.replays.close(refused.cache)
             raise
@@ -133,7 +136,7 @@ class RelayedStreams:
         for client, identity in change.unmatched:
             if identity in removed:
                 continue  # its channels are closed by now, or will be
-            self._close(client, identity, reason, now)
+            self.close(client, identity, reason, now)
             touched.add(identity)
         for identity in change.updated:  # the origin offers it anew, with other properties: so is it offered onwards
             self._offer_all(identity, self._routing.subscribers(identity), source, now)
@@ -163,6 +166,7 @@ class RelayedStreams:
         if relayed is None:
             return
         self.fanout.end(relayed)
+        self.moves.ended(identity)
         if relayed.cache is not None:
             self.replays.close(relayed.cache)
         if relayed.source is None:
@@ -223,11 +227,13 @@ class RelayedStreams:
     def offer(self, client: ClientName, identity: StreamId, now: float, *, first: int | None = None) -> None:
         """Open a channel, in place of the one there may be. `first`: the seq of its first message; None: what is next
         from the origin."""
-        self._close(client, identity, DropReason.DISCONNECTED, now)
+        self.close(client, identity, DropReason.DISCONNECTED, now)
         self._open(client, identity, now, first)
 
     def _open(self, client: ClientName, identity: StreamId, now: float, first: int | None) -> None:
         relayed = self.by_id[identity]
+        if first is None and self.moves.holds_back(client, relayed, now=now):
+            return
         link = self._clients.link(client, now)
         stream = relayed.stream.stream
         self.fanout.close(client, identity, now=now)  # of the same stream, before it ended
@@ -238,7 +244,7 @@ class RelayedStreams:
             relayed.outs[client] = ended
             self._presence.joined(identity.origin, client)
             return
-        held = self._held_for(relayed, client) if is_peer(client) else None
+        held = self.moves.begin_for(client, relayed) if self._routing.peers else None
         if held is not None:
             first = min(first, held.watermark + 1)
         try:
@@ -256,12 +262,14 @@ class RelayedStreams:
             relayed.outs[client] = (link, channel)
             self._presence.joined(identity.origin, client)
             if held is not None:
-                self._go_on_with(held, link, channel, now)
+                self.moves.go_on_with(held, link, channel, now)
 
-    def _close(self, client: ClientName, identity: StreamId, reason: DropReason, now: float) -> None:
+    def close(self, client: ClientName, identity: StreamId, reason: DropReason, now: float) -> None:
+        """Close the channel, if there is one."""
         relayed = self.by_id.get(identity)
         if relayed is None:
             return
+        self.moves.leave(client, identity)
         relayed.unopened.discard(client)
         relayed.waiting.pop(client, None)
         pair = relayed.outs.pop(client, None)
@@ -283,68 +291,6 @@ class RelayedStreams:
             self._end_channel(client, link, channel, DropReason.FORBIDDEN, now)
         else:
             self.draining.add(client, link, channel, max_bytes=self._clients.max_queue_bytes(client), now=now)
-
-    # --- to peers -------------------------------------------------------------------------------------------------
-
-    def hand_over(self, client: ClientName, peer: ClientName, now: float) -> None:
-        """The client is at a peer: that gets the streams of this relay's own clients in its place, from what the client
-        has not confirmed. What came from another relay is kept until that one has seen to it (`released`)."""
-        kept: list[TopicName] = []
-        for identity in self._routing.received_by(client):
-            relayed = self.by_id[identity]
-            if client not in relayed.outs or not relayed.outs[client][1].reliable:
-                continue
-            if not self._routing.offers(peer, identity):
-                kept.append(identity.topic)
-            elif peer in relayed.outs:
-                self._close(client, identity, DropReason.DISCONNECTED, now)
-            else:
-                self._clients.link(peer, now)
-                self.apply(self._routing.also(peer, identity.topic), now)
-                self._close(client, identity, DropReason.UNWANTED, now)
-        self.apply(self._routing.subscribe(client, exact=kept), now)
-
-    def released(self, client: ClientName, topic: TopicName, now: float, *, whole: bool) -> None:
-        """Who has the stream sees to it that the client gets it at its peer: all of it, or not what is held here."""
-        for identity in self._routing.received_by(client):
-            if identity.topic == topic and self._routing.via(identity) is not None:
-                self._close(client, identity, DropReason.UNWANTED if whole else DropReason.DISCONNECTED, now)
-        left = {identity.topic for identity in self._routing.received_by(client)} - {topic}
-        self.apply(self._routing.subscribe(client, exact=left), now)
-
-    def _held_for(self, relayed: Relayed, peer: ClientName) -> OutChannel | None:
-        """The channel with what a client has not confirmed that is at a peer by now; None: there is none."""
-        held: OutChannel | None = None
-        for name, (_link, channel) in relayed.outs.items():
-            behind = map(ClientName, channel.required) if is_peer(name) else (name,)
-            moved = [client for client in behind if name != peer and self._home(client) == peer]
-            if channel.reliable and moved and (held is None or channel.watermark < held.watermark):
-                held = channel
-                relayed.handed |= {(peer, client) for client in moved}
-        return held
-
-    def _go_on_with(self, held: OutChannel, link: Link, channel: OutChannel, now: float) -> None:
-        for out in list(held.retained):
-            if out.message.replay or out.seq < channel.next_seq:
-                continue
-            if out.seq > channel.next_seq:
-                link.outgoing.skip(channel, out.seq, now=now)
-            link.sender.submit(channel, out.message, now=now, forced=True)
-
-    def moved_to(self, link: Link, channel: OutChannel, now: float) -> None:
-        """A peer has said for whom a stream is: where these were before, nobody needs to keep it for them any more."""
-        relayed = self.by_id.get(channel.stream.id)
-        if relayed is None or not channel.reliable:
-            return
-        for name in map(ClientName, channel.required):
-            if self._home(name) != link.peer:
-                continue
-            for other, (_link, held) in relayed.outs.items():
-                if other != link.peer and is_peer(other) and name in held.required:
-                    whole = (link.peer, name) in relayed.handed
-                    said = {"t": "released", "client": name, "topic": channel.stream.id.topic, "whole": whole}
-                    self._clients.tell(other, said, now)
-            relayed.handed.discard((link.peer, name))
 
     def prime(self, link: Link, now: float) -> None:
         """The client is another process than before: it gets what is latched of all that it takes."""
@@ -391,6 +337,10 @@ class RelayedStreams:
 
     # --- to origins -----------------------------------------------------------------------------------------------
 
+    def answered(self, relayed: Relayed, now: float) -> None:
+        """Who gets the stream has changed."""
+        self._told(relayed, now)
+
     def _told(self, relayed: Relayed, now: float) -> None:
         """All subscribers have been told of a stream; to some it may have been impossible."""
         self._answer(relayed, now)
@@ -402,6 +352,9 @@ class RelayedStreams:
         if source is None:
             return
         wanted, required = self.wanted(relayed), relayed.required()
+        waiting = self.moves.waiting(relayed.stream.stream.id)
+        if waiting:
+            wanted, required = True, tuple(dict.fromkeys((*required, *waiting)))
         if not wanted and relayed.stream.stream.spec.durable and self._learns_until_s is not None:
             return
         source.answers.answer(relayed.stream, wanted, now=now, required=required)
@@ -442,6 +395,9 @@ class RelayedStreams:
         delivered = stream.delivered
         for _link, channel in relayed.outs.values():
             delivered = min(delivered, channel.watermark)
+        below = self.moves.confirms_below(stream.stream.id)
+        if below is not None:
+            delivered = min(delivered, below - 1)
         if stream.stream.spec.durable:  # what is on disk is ours to deliver
             delivered = max(delivered, min(self.on_disk(stream.stream.id), stream.delivered))
         source.taking.confirm(stream, delivered)
