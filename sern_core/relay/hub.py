@@ -309,7 +309,9 @@ class Hub:
     def _from_peer(self, client: ClientName, peer: ClientName, now: float) -> None:
         """Streams of the client that the peer has announced all along come from there now."""
         link = self.links.get(peer)
-        for identity in self.routing.streams_of(client) if link is not None else ():
+        if link is None:
+            return
+        for identity in self.routing.streams_of(client):
             stream, relayed = link.taking.streams.get(identity), self.relayed[identity]
             if stream is not None and stream.channel_id is not None and relayed.source is not link:
                 self.streams.take(link, stream, now).source = link

@@ -30,8 +30,8 @@ from sern_core.vocabulary.names import is_peer
 from sern_core.vocabulary.types import ClientName, DropReason, TopicName
 
 PATIENCE_S: Final = 5.0
-"""How long a home waits for `go`. A source that does not answer for so long has died: whoever takes its place knows from
-the origin for whom the stream is."""
+"""How long a home waits for `go`. A source that does not answer for so long has died: whoever takes its place knows
+from the origin for whom the stream is."""
 MAX_HELD_BACK: Final = 1000
 """Messages of one stream that are held back for a client meanwhile; with more it begins behind them."""
 
@@ -181,9 +181,9 @@ class Moves:
                 continue
             held = self._held(relayed, name, peer)
             sure.add((peer, name))
-            if held is not None and held.watermark + 1 < channel.next_seq:
-                if lacking is None or held.watermark < lacking.watermark:
-                    lacking = held
+            lacks = held is not None and held.watermark + 1 < channel.next_seq
+            if held is not None and lacks and (lacking is None or held.watermark < lacking.watermark):
+                lacking = held
         if lacking is not None:
             self._go_back(relayed, link, channel, lacking, now)
             return  # the peer says again for whom it is

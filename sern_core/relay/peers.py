@@ -167,7 +167,7 @@ class Peers:
         return owed
 
     def answered(self, link: Link, channel: OutChannel) -> list[str] | None:
-        """A peer has said for whom a stream is. Returns what it asks for, if it was owed the stream and is not any more."""
+        """A peer has said for whom a stream is. Returns what it asks for, if that was owed and is not any more."""
         topic = channel.stream.id.topic
         owed = self._owed.get(link.peer, set())
         if channel.required or topic not in owed:
