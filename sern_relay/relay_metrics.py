@@ -53,7 +53,7 @@ class Counting(Protocol):
 def register_relay(metrics: Metrics, relay: Counting) -> None:
     """Have `metrics` read all of them."""
     hub = relay.hub
-    register_links(metrics, lambda: list(hub.links.values()))
+    register_links(metrics, lambda: list(hub.links.values()), hub.clients.given_up.counters)
     relay.datagrams.register(metrics)
     register_received(metrics, hub.received, relay.readers.ages)
     register_codecs(metrics, relay.coder)
