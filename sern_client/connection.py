@@ -107,8 +107,8 @@ class Connection:
 
     @property
     def bad_frames(self) -> int:
-        """Frames from the relay on the stream that were not valid."""
-        return 0 if self.transport is None else self.transport.bad_frames
+        """Frames from the relay that were not valid, on whatever lane."""
+        return sum(part.bad_frames for part in (self.transport, self.lane, self.priority_lane) if part is not None)
 
     def wake(self) -> None:
         """The core may have something to send."""

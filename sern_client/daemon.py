@@ -118,7 +118,9 @@ class ClientDaemon:
             "summaries",
             "watching",
         )
-        self.message_log = MessageLog(loaded.resolve(model.message_log)) if model.message_log else None
+        self.message_log: MessageLog | None = None
+        if model.message_log:
+            self.message_log = MessageLog(loaded.resolve(model.message_log), partial(self.parts.ended, "message_log"))
         self.events = EventLog()
         self.site = Site(
             endpoint,

@@ -6,6 +6,7 @@ import logging
 import secrets
 import time
 from contextlib import AsyncExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -139,7 +140,9 @@ class RelayDaemon:
             "summary",
             "watching",
         )
-        self.message_log = MessageLog(loaded.resolve(model.message_log)) if model.message_log else None
+        self.message_log: MessageLog | None = None
+        if model.message_log:
+            self.message_log = MessageLog(loaded.resolve(model.message_log), partial(self.parts.ended, "message_log"))
         self.fates: LoggedFates | None = None
         if self.message_log is not None:
             self.fates = self.hub.forwarding.fates = LoggedFates(self.message_log, self.parts)

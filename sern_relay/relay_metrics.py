@@ -11,6 +11,7 @@ from sern_relay.keyring import RelayKeyring
 from sern_relay.readers import Readers
 from sern_relay.server import RelayServer
 from sern_relay.transforms import TransformObjects
+from sern_relay.udp import RelayLanes
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.collector import CollectorWatch
 from sern_runtime.datagram_watch import DatagramWatch
@@ -34,6 +35,7 @@ class Counting(Protocol):
     parts: OptionalParts
     adaptation: Adaptation | None
     server: RelayServer | None
+    lanes: RelayLanes | None
     zap: ZapHandler | None
     keyring: RelayKeyring | None
     readers: Readers
@@ -51,7 +53,7 @@ class Counting(Protocol):
 def register_relay(metrics: Metrics, relay: Counting) -> None:
     """Have `metrics` read all of them."""
     hub = relay.hub
-    register_links(metrics, lambda: list(hub.links.values()))
+    register_links(metrics, lambda: list(hub.links.values()), hub.clients.given_up.counters)
     relay.datagrams.register(metrics)
     register_received(metrics, hub.received, relay.readers.ages)
     register_codecs(metrics, relay.coder)
@@ -76,7 +78,7 @@ def register_relay(metrics: Metrics, relay: Counting) -> None:
     metrics.counter("sern_relay_refusals_total", "Announcements, subscriptions and objects refused, by code.",
                     ("code",), lambda: [((code,), float(n)) for code, n in relay.refusals.items()])  # fmt: skip
     metrics.counter("sern_bad_frames_total", "Frames that were not valid; their connections were closed.",
-                    read=lambda: [((), float(relay.server.bad_frames if relay.server else 0))])  # fmt: skip
+                    read=lambda: [((), float(_bad_frames(relay)))])  # fmt: skip
     metrics.counter("sern_relay_auth_total", "Answers of the ZAP handler.", ("result",),
                     lambda: _auth(relay.zap))  # fmt: skip
     metrics.counter("sern_relay_new_keys_total", "Further keys that clients have offered for themselves.", ("result",),
@@ -97,6 +99,11 @@ def register_relay(metrics: Metrics, relay: Counting) -> None:
                   read=lambda: [((), float(relay.reloads.failing))])  # fmt: skip
     metrics.counter("sern_relay_reload_failures_total", "Reloads that kept the old configuration.",
                     read=lambda: [((), float(relay.reloads.failures))])  # fmt: skip
+
+
+def _bad_frames(relay: Counting) -> int:
+    """Those on every lane."""
+    return sum(part.bad_frames for part in (relay.server, relay.lanes) if part is not None)
 
 
 def _auth(zap: ZapHandler | None) -> list[tuple[tuple[str, ...], float]]:

@@ -7,7 +7,7 @@ from typing import Final
 from sern_core.bodies.codecs import Coder
 from sern_core.link.link import Link
 from sern_core.link.view import LinkView
-from sern_core.vocabulary.ledger import LOSSES, NO_DROPS, ReceiveLedger
+from sern_core.vocabulary.ledger import LOSSES, NO_DROPS, ReceiveLedger, SendCounters
 from sern_core.vocabulary.types import CLASS_LABELS, DropReason
 from sern_runtime import clock
 from sern_runtime.metrics import LATENCY_EDGES_S, Histogram, HistogramCounts, Labels, Metrics
@@ -45,8 +45,15 @@ def _capacity(link: LinkView) -> float | None:
     return None if link.rate_bps is None else link.rate_bps / 8
 
 
-def register_links(metrics: Metrics, links: Callable[[], Collection[Link]]) -> None:
-    """State of every link and the fate of every message offered to it."""
+def register_links(
+    metrics: Metrics,
+    links: Callable[[], Collection[Link]],
+    given_up: Callable[[], Iterable[tuple[str, SendCounters]]] = tuple,
+) -> None:
+    """State of every link and the fate of every message offered to it.
+
+    `given_up`: peers whose links are gone, and counters of what they lost by that; their series go on with it.
+    """
 
     def per_link(read: Callable[[LinkView], float | None]) -> Callable[[], list[tuple[Labels, float]]]:
         def collect() -> list[tuple[Labels, float]]:
@@ -84,6 +91,18 @@ def register_links(metrics: Metrics, links: Callable[[], Collection[Link]]) -> N
                 for counters in link.counters.values()
                 for reason, count in _by_reason(counters.by_reason, LOSSES)
             ]
+        yield from [
+            ((peer, counters.topic, CLASS_LABELS[counters.priority], reason.value), float(counters.by_reason[reason]))
+            for peer, counters in given_up()
+            for reason in LOSSES
+        ]
+
+    def unconfirmed() -> Iterator[tuple[Labels, float]]:
+        yield from per_topic("reliable_unconfirmed")()
+        yield from [
+            ((peer, counters.topic, CLASS_LABELS[counters.priority]), float(counters.reliable_unconfirmed))
+            for peer, counters in given_up()
+        ]
 
     gauge, counter = metrics.gauge, metrics.counter
     peer = ("peer",)
@@ -110,7 +129,7 @@ def register_links(metrics: Metrics, links: Callable[[], Collection[Link]]) -> N
     counter("sern_messages_delivered_total", "Messages that the peer has (reliable: delivered to the far end).",
             topic, per_topic("delivered"))  # fmt: skip
     counter("sern_reliable_unconfirmed_total", "Reliable messages sent whole and given up unconfirmed; perhaps lost.",
-            topic, per_topic("reliable_unconfirmed"))  # fmt: skip
+            topic, unconfirmed)  # fmt: skip
     counter("sern_messages_refused_total", "Messages refused to their source: a reliable queue was full.",
             topic, per_topic("refused"))  # fmt: skip
     counter("sern_bytes_offered_total", "Bytes offered to a link.", topic, per_topic("offered_bytes"))

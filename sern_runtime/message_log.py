@@ -13,7 +13,7 @@ the file never holds up the event loop for long.
 import logging
 import time
 import zlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Final, TextIO
@@ -31,10 +31,12 @@ _log = logging.getLogger(__name__)
 
 
 class MessageLog:
-    """Raises ConfigError when the file cannot be opened. A full disk ends the log, in one line, not the forwarding."""
+    """Raises ConfigError when the file cannot be opened. A full disk ends the log, in one line that `on_end` gets, not
+    the forwarding."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, on_end: Callable[[str], None] = _log.error) -> None:
         self.path = path
+        self._on_end = on_end
         self.problem: str | None = None
         self._lines: list[str] = [",".join(HEADER)]
         self._size_bytes = 0
@@ -84,10 +86,10 @@ class MessageLog:
             self._file.flush()
         except OSError as error:
             self.problem = f"{self.path}: the message log ends here: {error.strerror}"
-            _log.error("%s", self.problem)
             with suppress(OSError):
                 self._file.close()
             self._file = None
+            self._on_end(self.problem)
 
     def close(self) -> None:
         self.flush()

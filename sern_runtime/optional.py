@@ -33,6 +33,12 @@ class OptionalParts:
         else:
             _log.warning("%s failed again: %s", part, key[1])
 
+    def ended(self, part: str, problem: str) -> None:
+        """Count the end of a part for want of something that is not ours to give, such as room on a disk, and say the
+        problem in one line."""
+        self.failures[part] = self.failures.get(part, 0) + 1
+        _log.error("%s", problem)
+
     @contextmanager
     def survive(self, part: str) -> Iterator[None]:
         """Whatever goes wrong inside is this part's alone."""

@@ -8,6 +8,7 @@ from sern_core.link.handshake import DISPLACED
 from sern_core.link.link import Link
 from sern_core.relay.access import AccessTable, ClientLimits, RateGuard
 from sern_core.relay.bound import QueueBound
+from sern_core.relay.given_up import GivenUp
 from sern_core.relay.hub_events import GuardedEvents
 from sern_core.relay.hub_port import HubPort
 from sern_core.vocabulary.limits import PeerLimits
@@ -46,6 +47,7 @@ class Clients:
         self._guards: dict[ClientName, RateGuard] = {}
         self._bounds: dict[ClientName, QueueBound] = {}
         self._absent_since: dict[ClientName, float] = {}
+        self.given_up = GivenUp()
 
     # --- coming and going -----------------------------------------------------------------------------------------
 
@@ -56,6 +58,7 @@ class Clients:
             link = self.links[client] = self._make_link(client, now)
             self._limit(client, now)
             self._absent_since[client] = now
+            self.given_up.back(client)
         return link
 
     def greet(self, port: HubPort, hello: framing.Envelope, header: framing.Header, *, now: float) -> None:
@@ -207,6 +210,7 @@ class Clients:
                 link.close("it does not read what it is told", now=now)
         for client in [client for client in self._guards.keys() - self.links.keys() if self._guards[client].full(now)]:
             del self._guards[client]  # by name, over sessions: one that comes back at once has no new burst
+        self.given_up.sweep(now=now)
 
     def validate(self) -> None:
         """Internal consistency, for tests."""

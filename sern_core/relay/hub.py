@@ -268,10 +268,13 @@ class Hub:
 
     def _forget(self, client: ClientName, now: float, *, reason: DropReason = DropReason.DISCONNECTED) -> None:
         link = self.links[client]
+        reliable = {channel.counters.topic for channel in link.sender.channels.values() if channel.reliable}
         self.streams.drop_client(client, reason, now)
         self.events.lane_closed(client)
         link.close_streams()
         self.clients.forget(client)
+        lost = [counters for counters in link.counters.values() if counters.topic in reliable]
+        self.clients.given_up.keep(client, lost, now=now)
         self.traces.forget(client)
         self._subscriptions.pop(client, None)
         self.matching.forget(client)

@@ -18,12 +18,15 @@ from urllib.request import urlopen
 from ruamel.yaml import YAML
 
 from sern_tools.ports import free_ports
+from tests.daemons import HOST, Process
 from tests.support import until
 
 NEEDED: Final = ("prometheus", "promtool")
 FACTOR: Final = 30.0
 SHORTEST_WINDOW_S: Final = 8.0
 SHORTEST_FOR_S: Final = 1.0
+Jobs = Mapping[str, Sequence[Process | str]]
+"""What is scraped by the name of its job: daemons, or addresses."""
 _SECONDS: Final = {"s": 1.0, "m": 60.0, "h": 3600.0}
 _WINDOW: Final = re.compile(r"\[(\d+)([smh])\]")
 
@@ -67,8 +70,16 @@ class Prometheus:
         assert content["status"] == "success", content
         return content["data"]
 
-    def up(self) -> bool:
-        """Whether it answers and every target was scraped."""
+    @staticmethod
+    def target(of: Process | str) -> str:
+        """The label `instance` of what is scraped."""
+        return of if isinstance(of, str) else f"{HOST}:{of.port}"
+
+    async def until_up(self) -> None:
+        """Wait until it answers and every target was scraped."""
+        await until(self._up, "every daemon is scraped")
+
+    def _up(self) -> bool:
         try:
             return all(target["health"] == "up" for target in self._targets())
         except (URLError, ConnectionError):
@@ -87,15 +98,23 @@ class Prometheus:
         """The names of the alerts that fire."""
         return {alert["labels"]["alertname"] for alert in self._get("alerts")["alerts"] if alert["state"] == "firing"}
 
-    async def until_firing(self, name: str) -> None:
-        await until(lambda: name in self.firing(), f"{name} fires")
+    async def until_asked(self, expression: str) -> None:
+        """Wait until an expression has data."""
+        await until(lambda: self.asked(expression), f"{expression} has data")
 
-    async def until_clear(self, name: str) -> None:
-        await until(lambda: name not in self.firing(), f"{name} is over")
+    async def until_fired(self, name: str, **labels: str) -> None:
+        """Wait until the alert has fired with these labels, now or before: what happens once is soon over."""
+        wanted = {"alertname": name, "alertstate": "firing", **labels}
+        matchers = ",".join(f'{label}="{value}"' for label, value in wanted.items())
+        await until(lambda: self.asked(f"count_over_time(ALERTS{{{matchers}}}[1h])"), f"{name} fires, {labels}")
+
+    async def until_clear(self, *names: str) -> None:
+        """Wait until none of them fires."""
+        await until(lambda: not self.firing() & set(names), f"{', '.join(names)} are over")
 
 
 @contextmanager
-def prometheus(directory: Path, rules: Mapping[str, Any], jobs: Mapping[str, Sequence[str]]) -> Iterator[Prometheus]:
+def prometheus(directory: Path, rules: Mapping[str, Any], jobs: Jobs) -> Iterator[Prometheus]:
     """One that scrapes these targets by job each second, while the block runs; `rules` are looked at each second."""
     (port,) = free_ports(1)
     yaml = YAML()
@@ -105,7 +124,8 @@ def prometheus(directory: Path, rules: Mapping[str, Any], jobs: Mapping[str, Seq
         "global": {"scrape_interval": "1s", "scrape_timeout": "1s", "evaluation_interval": "1s"},
         "rule_files": ["rules.yml"],
         "scrape_configs": [
-            {"job_name": job, "static_configs": [{"targets": list(targets)}]} for job, targets in jobs.items()
+            {"job_name": job, "static_configs": [{"targets": [Prometheus.target(each) for each in targets]}]}
+            for job, targets in jobs.items()
         ],
     }
     with (directory / "prometheus.yml").open("w") as file:

@@ -1,6 +1,6 @@
 """Every alert fires when what it watches is broken, and clears when it is mended: over made-up series, by promtool.
 
-A real Prometheus over real daemons is in test_prometheus, for those whose cause can be made within seconds.
+The rules are as they are shipped, with their minutes. A real Prometheus over real daemons is in test_prometheus.
 """
 
 import asyncio

@@ -1,11 +1,12 @@
 """Dashboards and alerts in a real Prometheus over real daemons: what is asked is answered, alerts fire and clear.
 
-Of the alerts those are here whose cause can be made and undone within seconds: a robot, its link and its operator are
-gone, a reload fails, strangers come. The others' expressions are parsed and their metrics looked for in test_metrics.
+Here a robot, its link and its operator are gone, a reload fails, and strangers come. What needs a site that stands
+still is in test_prometheus_queues, and what needs a bad network or a part that fails in test_prometheus_network.
 """
 
 import signal
-from functools import partial
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -16,9 +17,10 @@ from sern_runtime.config.keys import load_public
 from sern_sim.models import LinkModel
 from sern_tools.proxy import Route, ShapingProxy
 from tests.daemons import HOST, Json, Lab, Process
-from tests.deploy.prometheus import Prometheus, missing, prometheus, scaled
-from tests.deploy.test_metrics import DASHBOARDS, RULES, expressions_of
-from tests.support import until
+from tests.deploy import test_prometheus_network as network
+from tests.deploy import test_prometheus_queues as queues
+from tests.deploy.prometheus import Jobs, Prometheus, missing, prometheus, scaled
+from tests.deploy.test_metrics import DASHBOARDS, RULES, alerts, expressions_of
 
 pytestmark = pytest.mark.skipif(missing() is not None, reason=missing() or "")
 
@@ -40,8 +42,14 @@ OPERATOR: Final[Json] = {"kind": "synthetic", "role": "operator", "command_topic
 LINK: Final = LinkModel(rate_bps=4e5, delay_s=0.01, loss=0.05, overhead_bytes=28)
 """The robot's, which carries less than there is, so that it is full, and loses some of it."""
 KNOCKS: Final = 20
+ALERTS: Final = ("SernDown", "SernLinkDown", "SernPeerGone", "SernReloadFailed", "SernCommandLease", "SernAuthRefused")
 FAR_HOST: Final = "127.0.0.2"
 """Where the far end of that link is."""
+
+
+def test_every_alert_is_fired_by_daemons() -> None:
+    fired = (*ALERTS, *network.ALERTS, *queues.ALERTS)
+    assert sorted(fired) == sorted(rule["alert"] for rule in alerts())
 
 
 class Site:
@@ -64,14 +72,15 @@ class Site:
         }
         self.running: dict[str, Process] = {}
 
-    async def start(self, name: str) -> None:
-        self.running[name] = await self.lab.process(self.files[name]).ready()
+    def start(self, name: str) -> Process:
+        process = self.running[name] = self.lab.process(self.files[name])
+        return process
 
     def target(self, name: str) -> str:
-        return f"{HOST}:{self.running[name].port}"
+        return Prometheus.target(self.running[name])
 
-    def jobs(self) -> dict[str, list[str]]:
-        return {"sern-relay": [self.target("relay")], "sern-client": [self.target("robot1"), self.target("site")]}
+    def jobs(self) -> Jobs:
+        return {"sern-relay": [self.running["relay"]], "sern-client": [self.running["robot1"], self.running["site"]]}
 
 
 async def test_every_panel_has_data_and_alerts_fire_and_clear(tmp_path: Path) -> None:
@@ -81,59 +90,52 @@ async def test_every_panel_has_data_and_alerts_fire_and_clear(tmp_path: Path) ->
         proxy.start()
         site = Site(lab)
         for name in site.files:
-            await site.start(name)
+            site.start(name)
         with prometheus(tmp_path, scaled(RULES), site.jobs()) as server:
-            await until(server.up, "every daemon is scraped")
+            await server.until_up()
             await every_panel_has_data(server)
+            await an_operator_that_is_killed_a_reload_that_fails_and_strangers(site, server)
             await a_robot_that_is_killed(site, server)
-            await a_reload_that_fails(site, server)
-            await strangers_at_the_door(lab, server)
+            await server.until_clear(*ALERTS)
 
 
 async def every_panel_has_data(server: Prometheus) -> None:
     for expression in (text for name in DASHBOARDS for text in expressions_of(name)):
-        await until(partial(server.asked, expression), f"{expression} has data")
+        await server.until_asked(expression)
 
 
-async def a_robot_that_is_killed(site: Site, server: Prometheus) -> None:
-    site.running["robot1"].kill()
-    for name in ("SernDown", "SernLinkDown", "SernPeerGone"):
-        await server.until_firing(name)
-    await site.start("robot1")
-    for name in ("SernDown", "SernLinkDown", "SernPeerGone"):
-        await server.until_clear(name)
-    await server.until_clear("SernCommandLease")
+async def an_operator_that_is_killed_a_reload_that_fails_and_strangers(site: Site, server: Prometheus) -> None:
     site.running["site"].kill()  # its commands cease, and the robot's client stops it
-    await server.until_firing("SernCommandLease")
-    await site.start("site")
-    await server.until_clear("SernCommandLease")
-
-
-async def a_reload_that_fails(site: Site, server: Prometheus) -> None:
     file = site.files["relay"]
     good = file.read_text()
     file.write_text("{}")
     site.running["relay"].signal(signal.SIGHUP)
-    await server.until_firing("SernReloadFailed")
+    with strangers_at_the_door(site.lab):
+        await server.until_fired("SernAuthRefused", instance=site.target("relay"), result="unknown_key")
+    await server.until_fired("SernReloadFailed", instance=site.target("relay"))
+    await server.until_fired("SernCommandLease", instance=site.target("robot1"))
     file.write_text(good)
     site.running["relay"].signal(signal.SIGHUP)
-    await server.until_clear("SernReloadFailed")
+    await site.start("site").ready()
 
 
-async def strangers_at_the_door(lab: Lab, server: Prometheus) -> None:
+async def a_robot_that_is_killed(site: Site, server: Prometheus) -> None:
+    site.running["robot1"].kill()
+    await server.until_fired("SernDown", instance=site.target("robot1"))
+    await server.until_fired("SernLinkDown", instance=site.target("relay"), peer="robot1")
+    await server.until_fired("SernPeerGone", instance=site.target("site"), peer="robot1")
+    await site.start("robot1").ready()
+
+
+@contextmanager
+def strangers_at_the_door(lab: Lab) -> Iterator[None]:
+    """Many knock with keys that the relay does not know, again and again while the block runs."""
     relay_key = load_public(lab.directory / "relay.pub").keys[0].key.encode()
-    with zmq.Context() as context:
-        sockets = []
+    with zmq.Context() as context, ExitStack() as stack:
         for _ in range(KNOCKS):
             stranger = context.socket(zmq.DEALER)
-            stranger.linger = 0
+            stack.callback(stranger.close, linger=0)
             stranger.curve_publickey, stranger.curve_secretkey = zmq.curve_keypair()
             stranger.curve_serverkey = relay_key
             stranger.connect(lab.endpoint)
-            sockets.append(stranger)
-        try:
-            await server.until_firing("SernAuthRefused")
-        finally:
-            for stranger in sockets:
-                stranger.close()
-    await server.until_clear("SernAuthRefused")
+        yield
