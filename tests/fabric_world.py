@@ -126,6 +126,10 @@ class FabricWorld(World):
         for relay in self.relays.values():
             yield from relay.links()
 
+    def watch(self, period_s: float = 0.1) -> "FabricWorld":
+        super().watch(period_s)
+        return self
+
     def validate(self) -> None:
         super().validate()
         for relay in self.relays.values():
