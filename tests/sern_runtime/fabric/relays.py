@@ -1,0 +1,117 @@
+"""Ports of relays on loopback, what their owners were told, and certificates for them."""
+
+import asyncio
+from collections.abc import AsyncIterator, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+from sern_core.vocabulary.types import ClientName
+from sern_runtime.config.fabric import CA_FILE, CertificateFiles, certificate_file, key_file
+from sern_runtime.fabric.port import Claim, PeerRelay
+from sern_runtime.fabric.zenoh_port import ZenohPort
+from sern_runtime.fabric.zenoh_settings import FabricOptions
+from sern_tools.ports import free_ports
+from tests.support import DEADLINE_S
+
+BOOT = 2**62 + 7
+A, B, C = (ClientName(name) for name in ("relay_a", "relay_b", "relay_c"))
+
+
+class Told:
+    """A `FabricEvents` that writes down, and wakes whoever waits."""
+
+    def __init__(self) -> None:
+        self.peers: dict[ClientName, PeerRelay] = {}
+        self.claims: set[Claim] = set()
+        self.news: list[tuple[str, object]] = []
+        self.datagrams: list[tuple[ClientName, bytes]] = []
+        self.raises_at_bytes: int | None = None
+        """An owner's error at every datagram of that size."""
+        self._changed = asyncio.Event()
+
+    def peer_up(self, peer: PeerRelay) -> None:
+        self.peers[peer.name] = peer
+        self._note("up", peer)
+
+    def peer_down(self, name: ClientName, boot: int) -> None:
+        if self.peers[name].boot == boot:
+            del self.peers[name]
+        self._note("down", (name, boot))
+
+    def claimed(self, claim: Claim) -> None:
+        assert claim not in self.claims
+        self.claims.add(claim)
+        self._note("claimed", claim)
+
+    def released(self, claim: Claim) -> None:
+        self.claims.remove(claim)
+        self._note("released", claim)
+
+    def arrived(self, source: ClientName, datagram: bytes) -> None:
+        self.datagrams.append((source, datagram))
+        self._changed.set()
+        if len(datagram) == self.raises_at_bytes:
+            raise ZeroDivisionError
+
+    def _note(self, kind: str, what: object) -> None:
+        self.news.append((kind, what))
+        self._changed.set()
+
+    async def until(self, condition: Any) -> None:
+        """Until it holds; it is looked at whenever something was told."""
+        async with asyncio.timeout(DEADLINE_S):
+            while not condition():
+                await self._changed.wait()
+                self._changed.clear()
+
+
+class Relay:
+    """A port that runs, and what it told."""
+
+    def __init__(self, options: FabricOptions) -> None:
+        self.told = Told()
+        self.port = ZenohPort(options, self.told)
+        self.name = options.name
+
+    async def until(self, condition: Any) -> None:
+        await self.told.until(condition)
+
+
+def files(folder: Path, relay: str, *, key_of: str | None = None, ca: Path | None = None) -> CertificateFiles:
+    """The certificate files of a relay, with another's key or another authority where a test wants that."""
+    key = folder / key_file(key_of or relay)
+    return CertificateFiles((ca or folder) / CA_FILE, folder / certificate_file(relay), key)
+
+
+def options(name: ClientName, *, listen: int | None = None, connect: Sequence[int] = (), **more: Any) -> FabricOptions:
+    """On loopback; over TLS where `certificates` are given."""
+    protocol = "tcp" if more.get("certificates") is None else "tls"
+    if more.get("certificates") is not None:
+        more.setdefault("relays", tuple(other for other in (A, B, C) if other != name))
+    return FabricOptions(
+        name=name,
+        boot=more.pop("boot", BOOT),
+        listen=() if listen is None else (f"{protocol}/127.0.0.1:{listen}",),
+        peers=tuple(f"{protocol}/127.0.0.1:{port}" for port in connect),
+        **more,
+    )
+
+
+@asynccontextmanager
+async def running(*chosen: FabricOptions) -> AsyncIterator[list[Relay]]:
+    async with AsyncExitStack() as stack:
+        relays = []
+        for each in chosen:
+            relay = Relay(each)
+            stack.push_async_callback(relay.port.close)
+            await relay.port.start()
+            relays.append(relay)
+        yield relays
+
+
+def chain(certificates: Path | None = None, **more: Any) -> tuple[FabricOptions, FabricOptions]:
+    """Two relays, of which the second connects."""
+    (port,) = free_ports(1)
+    own = (None, None) if certificates is None else (files(certificates, A), files(certificates, B))
+    return options(A, listen=port, certificates=own[0], **more), options(B, connect=[port], certificates=own[1], **more)
