@@ -61,7 +61,8 @@ class Link:
     """One end of one hop towards `peer`.
 
     `definitions` is shared by all links of a process. `auto_confirm`: what had its turn here
-    is delivered; a relay confirms by hand, when its subscribers have.
+    is delivered; a relay confirms by hand, when its subscribers have. `lossless` and `any_size` say what the lane is on
+    which the session begins (`path.lanes.Lane`).
     """
 
     def __init__(
@@ -78,6 +79,7 @@ class Link:
         trace: DecisionTrace,
         now: float,
         lossless: bool = True,
+        any_size: bool | None = None,
         auto_confirm: bool = True,
     ) -> None:
         self.definitions = definitions
@@ -97,6 +99,7 @@ class Link:
         lanes = self.lanes = LaneSet(
             end,
             lossless=lossless,
+            any_size=any_size,
             paper=sender.paper,
             settled=self._settled,
             give_back=self._give_back,
