@@ -1,7 +1,7 @@
 """Ports of relays on loopback, what their owners were told, and certificates for them."""
 
 import asyncio
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,8 @@ class Told:
         self.claims: set[Claim] = set()
         self.news: list[tuple[str, object]] = []
         self.datagrams: list[tuple[ClientName, bytes]] = []
+        self.on_datagram: Callable[[ClientName, bytes], None] = lambda _source, _datagram: None
+        """Is told of each datagram as well."""
         self.raises_at_bytes: int | None = None
         """An owner's error at every datagram of that size."""
         self._changed = asyncio.Event()
@@ -51,6 +53,7 @@ class Told:
     def arrived(self, source: ClientName, datagram: bytes) -> None:
         self.datagrams.append((source, datagram))
         self._changed.set()
+        self.on_datagram(source, datagram)
         if len(datagram) == self.raises_at_bytes:
             raise ZeroDivisionError
 
@@ -58,7 +61,7 @@ class Told:
         self.news.append((kind, what))
         self._changed.set()
 
-    async def until(self, condition: Any) -> None:
+    async def until(self, condition: Callable[[], object]) -> None:
         """Until it holds; it is looked at whenever something was told."""
         async with asyncio.timeout(DEADLINE_S):
             while not condition():
@@ -74,7 +77,7 @@ class Relay:
         self.port = ZenohPort(options, self.told)
         self.name = options.name
 
-    async def until(self, condition: Any) -> None:
+    async def until(self, condition: Callable[[], object]) -> None:
         await self.told.until(condition)
 
 

@@ -2,6 +2,7 @@
 
 import asyncio
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -24,7 +25,11 @@ AGAIN_S = 1.0
 async def meet(*relays: Relay) -> None:
     """Until each knows all others."""
     for relay in relays:
-        await relay.until(lambda relay=relay: len(relay.told.peers) == len(relays) - 1)
+        await relay.until(partial(_knows, relay, len(relays) - 1))
+
+
+def _knows(relay: Relay, count: int) -> bool:
+    return len(relay.told.peers) == count
 
 
 async def send_until(sender: Relay, receiver: Relay, body: bytes, priority: PriorityClass) -> None:
