@@ -87,8 +87,8 @@ class CertificatesSection(Section):
 
 
 class FabricSection(Section):
-    """Other relays that this one forms a fabric with (docs/fabric.md). Needs the extra `zenoh`. A relay reaches another
-    one over a connection of their own, which either may make."""
+    """Other relays that this one forms a fabric with (docs/fabric.md). Needs the extra `zenoh`. Every two relays need a
+    connection, which either may make."""
 
     listen: Annotated[tuple[ListenLocator, ...], Field(max_length=16)] = ()
     """Where other relays connect: tls/address:port, or tcp/address:port on loopback; `*` is every address."""
@@ -104,8 +104,8 @@ class FabricSection(Section):
     """The folder with ca.pem, NAME.pem and NAME-key.pem of `sern keygen fabric`, NAME being this relay's, or a mapping
     of `ca`, `certificate` and `key`. Needed beyond loopback."""
     external: bool = False
-    """Be a client of external zenoh routers in place of a router of its own. Who may write which key is theirs to check
-    then (docs/fabric.md)."""
+    """Be a client of zenoh routers of your own, in place of connections between the relays. Who may write which key is
+    theirs to check then (docs/fabric.md)."""
     lease_s: Annotated[float, Field(ge=0.5, le=60)] = LEASE_S
     """A relay of which nothing is heard for so long is gone."""
 

@@ -13,7 +13,7 @@ import logging
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from threading import Lock
+from threading import Event, Lock
 from time import perf_counter
 from types import ModuleType
 from typing import Any, Final
@@ -25,7 +25,7 @@ from sern_runtime.config.endpoints import installing
 from sern_runtime.config.fabric import FabricSection
 from sern_runtime.fabric import keys
 from sern_runtime.fabric.port import Claim, FabricCounters, FabricDrop, FabricEvents, PeerRelay
-from sern_runtime.fabric.zenoh_settings import FabricOptions, settings
+from sern_runtime.fabric.zenoh_settings import RETRY_MAX_S, FabricOptions, settings
 
 BATCH: Final = 200
 """Datagrams handed over in one turn of the loop: others get their turn."""
@@ -62,6 +62,10 @@ def options_of(
     )
 
 
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:300]
+
+
 class ZenohPort:
     """A `FabricPort`; `events` is told. All calls on the thread of the loop that `start` ran in."""
 
@@ -73,6 +77,7 @@ class ZenohPort:
         self._session: Any = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._closed = False
+        self._leaving = Event()
         self._keeps: list[Any] = []  # what zenoh undeclares when nobody has it any more
         zenoh = self._zenoh
         self._priorities = {
@@ -105,23 +110,48 @@ class ZenohPort:
     async def start(self) -> None:
         """Raises ConfigError of one line."""
         self._loop = asyncio.get_running_loop()
-        opening = self._loop.run_in_executor(self._declaring, self._open)
+        try:
+            config = self._config()
+            if self._options.external:
+                self._declaring.submit(self._open_when_there_is_a_router, config)
+            else:
+                await self._open_now(self._loop.run_in_executor(self._declaring, self._open, config))
+        except self._zenoh.ZError as error:
+            await self.close()
+            raise ConfigError(f"zenoh does not start: {_one_line(error)}") from error
+
+    async def _open_now(self, opening: asyncio.Future[None]) -> None:
         try:
             await asyncio.shield(opening)
         except asyncio.CancelledError:
             await asyncio.wait([opening])
             await self.close()
             raise
-        except self._zenoh.ZError as error:
-            await self.close()
-            raise ConfigError(f"zenoh does not start: {' '.join(str(error).split())[:300]}") from error
 
-    def _open(self) -> None:
+    def _config(self) -> Any:
+        config = self._zenoh.Config()
+        for key, value in settings(self._options).items():
+            config.insert_json5(key, json.dumps(value))
+        return config
+
+    def _open_when_there_is_a_router(self, config: Any) -> None:
+        """In the thread, until `close`. What else waits for the thread, waits for the session as well."""
+        said = False
+        while not self._leaving.is_set():
+            try:
+                self._open(config)
+            except self._zenoh.ZError as error:
+                if not said:
+                    said = True
+                    where = ", ".join(self._options.peers)
+                    _log.warning("no router of the fabric answers at %s, tried on: %s", where, _one_line(error))
+                self._leaving.wait(RETRY_MAX_S)
+            else:
+                return
+
+    def _open(self, config: Any) -> None:
         """In the thread. The inbox comes before the token: whoever sees that may send."""
         zenoh, options = self._zenoh, self._options
-        config = zenoh.Config()
-        for key, value in settings(options).items():
-            config.insert_json5(key, json.dumps(value))
         session = self._session = zenoh.open(config)
         straight = zenoh.handlers.Callback
         inbox = straight(self._on_datagram, indirect=False)
@@ -137,6 +167,7 @@ class ZenohPort:
         if self._closed:
             return
         self._closed = True
+        self._leaving.set()
         if self._loop is not None:
             await self._loop.run_in_executor(self._declaring, self._leave)
         self._declaring.shutdown()

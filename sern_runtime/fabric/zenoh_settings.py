@@ -2,8 +2,12 @@
 
 Everything that finds peers by itself is off, as are shared memory (it went around the link on one host), multilink
 and the space of administration. With certificates each relay lets others write by the common name of the certificate of
-their connection alone: `h/SELF/THEIRS/*`, tokens that have their name, and a subscription to their own inbox. So what
-a relay passes on for another is refused, and every two relays need a connection of their own.
+their connection alone: `h/SELF/THEIRS/*`, tokens that have their name, and a subscription to their own inbox.
+
+Every two relays need a connection of their own, and a relay is there as long as that is: zenoh's mode is `peer`. As
+routers they would pass each other's tokens and datagrams on, and the rules refuse what comes from another than its
+source: with three relays and one connection cut, both ends went on seeing each other through the third, and nothing
+arrived (measured).
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,6 +23,8 @@ from sern_runtime.fabric.port import PeerRelay
 RETRY_FIRST_S: Final = 0.25
 RETRY_MAX_S: Final = 4.0
 """Pauses between tries to reach a peer: each is twice the one before, within these two."""
+ROUTER_S: Final = 1.0
+"""How long one try to reach an external router takes."""
 WAIT_BEFORE_DROP_US: Final = 1000
 """How long a put may wait, and hold the event loop, for room in a full queue. 0 loses datagrams of an idle link: a
 queue is also full while the thread that sends takes what is in it (measured: 3 of 200)."""
@@ -62,13 +68,14 @@ class FabricOptions:
 def settings(options: FabricOptions) -> Mapping[str, Any]:
     """Keys of zenoh's configuration, with values as JSON has them."""
     found: dict[str, Any] = {
-        "mode": "client" if options.external else "router",
+        "mode": "client" if options.external else "peer",
         "listen/endpoints": [_everywhere(locator) for locator in options.listen],
         "connect/endpoints": list(options.peers),
-        # A peer may come later than we do, and go.
         "listen/exit_on_failure": True,
-        "connect/timeout_ms": -1,
-        "connect/exit_on_failure": False,
+        # A peer may come later than we do, and go. Zenoh's client opens no session before it has its router; how often
+        # that is tried is up to `zenoh_port`.
+        "connect/timeout_ms": round(1000 * ROUTER_S) if options.external else -1,
+        "connect/exit_on_failure": options.external,
         "connect/retry": {
             "period_init_ms": round(1000 * RETRY_FIRST_S),
             "period_max_ms": round(1000 * RETRY_MAX_S),

@@ -84,7 +84,7 @@ def test_what_zenoh_is_told(folder: Path, certificates: str) -> None:
     assert loaded.model.fabric is not None
     options = options_of(loaded.model.fabric, folder, name=ClientName(HUB), boot=1)
     told = settings(options)
-    assert (told["mode"], told["listen/endpoints"]) == ("router", ["tls/[::]:7447"])
+    assert (told["mode"], told["listen/endpoints"]) == ("peer", ["tls/[::]:7447"])
     assert told["connect/endpoints"] == ["tls/h:1"]
     for key in ("transport/shared_memory/enabled", "scouting/multicast/enabled", "scouting/gossip/enabled"):
         assert told[key] is False

@@ -1,8 +1,9 @@
 """Ports of relays on loopback, what their owners were told, and certificates for them."""
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Sequence
-from contextlib import AsyncExitStack, asynccontextmanager
+import json
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -118,3 +119,95 @@ def chain(certificates: Path | None = None, **more: Any) -> tuple[FabricOptions,
     (port,) = free_ports(1)
     own = (None, None) if certificates is None else (files(certificates, A), files(certificates, B))
     return options(A, listen=port, certificates=own[0], **more), options(B, connect=[port], certificates=own[1], **more)
+
+
+class Wire:
+    """What is between a relay and the port that it connects to."""
+
+    def __init__(self, to: int) -> None:
+        self.port = 0
+        self._to = to
+        self._open = asyncio.Event()
+        self._open.set()
+        self._cut = False
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._server: asyncio.Server | None = None
+
+    async def start(self) -> None:
+        self._server = await asyncio.start_server(self._accept, "127.0.0.1", 0)
+        self.port = self._server.sockets[0].getsockname()[1]
+
+    def close_door(self, *, cut: bool) -> None:
+        """Let nothing through. `cut`: connections end, and no new ones begin; else they stay, and are silent."""
+        self._open.clear()
+        self._cut = cut
+        if cut:
+            for task in self._tasks:
+                task.cancel()
+
+    def open_door(self) -> None:
+        self._cut = False
+        self._open.set()
+
+    async def stop(self) -> None:
+        if self._server is not None:
+            self._server.close()
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if self._cut:
+            writer.transport.abort()
+            return
+        task = asyncio.create_task(self._carry(reader, writer))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _carry(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        others: list[asyncio.StreamWriter] = [writer]
+        try:
+            there, back = await asyncio.open_connection("127.0.0.1", self._to)
+            others.append(back)
+            async with asyncio.TaskGroup() as group:
+                group.create_task(self._one_way(reader, back))
+                group.create_task(self._one_way(there, writer))
+        except* OSError:
+            pass
+        finally:
+            for each in others:
+                each.transport.abort()
+
+    async def _one_way(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while data := await reader.read(65_536):
+            await self._open.wait()
+            writer.write(data)
+            await writer.drain()
+        raise ConnectionError
+
+
+@asynccontextmanager
+async def between(port: int) -> AsyncIterator[Wire]:
+    wire = Wire(port)
+    await wire.start()
+    try:
+        yield wire
+    finally:
+        await wire.stop()
+
+
+@contextmanager
+def external_router(port: int) -> Iterator[None]:
+    """A zenoh router that is none of ours."""
+    import zenoh
+
+    config = zenoh.Config()
+    for key, value in {
+        "mode": "router",
+        "listen/endpoints": [f"tcp/127.0.0.1:{port}"],
+        "scouting/multicast/enabled": False,
+        "transport/shared_memory/enabled": False,
+    }.items():
+        config.insert_json5(key, json.dumps(value))
+    with zenoh.open(config):
+        yield

@@ -1,6 +1,7 @@
 """Two and three relays over zenoh on loopback: who is there, what arrives and from whom, and what is dropped."""
 
 import asyncio
+import sys
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -14,12 +15,26 @@ from sern_runtime.fabric.port import Claim, FabricDrop, PeerRelay
 from sern_runtime.fabric.zenoh_port import ZenohPort
 from sern_runtime.fabric.zenoh_settings import WHOLE_BYTES
 from sern_tools.ports import free_ports
-from tests.sern_runtime.fabric.relays import BOOT, A, B, C, Relay, Told, chain, files, options, running
+from tests.sern_runtime.fabric.relays import (
+    BOOT,
+    A,
+    B,
+    C,
+    Relay,
+    Told,
+    between,
+    chain,
+    external_router,
+    files,
+    options,
+    running,
+)
 
 pytest.importorskip("zenoh", reason="zenoh is not installed")
 
 ROBOT = ClientName("robot1")
 AGAIN_S = 1.0
+LEASE_S = 0.5
 
 
 async def meet(*relays: Relay) -> None:
@@ -152,7 +167,7 @@ async def test_an_event_that_raises_stops_nothing() -> None:
 
 @pytest.mark.parametrize("secured", [False, True], ids=["tcp", "tls"])
 async def test_relays_between_which_there_is_no_connection(certificates: Path, secured: bool) -> None:
-    """In the middle is another one: with certificates it cannot speak for others, and they do not meet."""
+    """In the middle is another one, which does not speak for others: they do not meet."""
     one, other = free_ports(2)
     own = [files(certificates, name) if secured else None for name in (A, B, C)]
     chosen = (
@@ -164,10 +179,6 @@ async def test_relays_between_which_there_is_no_connection(certificates: Path, s
         await b.until(lambda: set(b.told.peers) == {A, C})
         await a.until(lambda: B in a.told.peers)
         await c.until(lambda: B in c.told.peers)
-        if not secured:
-            await meet(a, b, c)
-            await send_until(a, c, b"through b", PriorityClass.STATE)
-            return
         # What B was told by C has come to A as well, by now, if it comes at all.
         c.port.claim(ROBOT, 1)
         await b.until(lambda: b.told.claims)
@@ -175,6 +186,59 @@ async def test_relays_between_which_there_is_no_connection(certificates: Path, s
         await a.until(lambda: a.told.claims)
         assert (set(a.told.peers), set(c.told.peers)) == ({B}, {B})
         assert [claim.client for claim in a.told.claims] == ["robot2"]
+
+
+@pytest.mark.parametrize("how", ["cut", "silent"])
+async def test_a_connection_that_is_gone_for_a_while(certificates: Path, how: str) -> None:
+    """Of three relays two lose each other, although the third sees both; and find each other again."""
+    ports = free_ports(2)
+    own = [files(certificates, name) for name in (A, B, C)]
+    async with between(ports[0]) as wire:
+        chosen = (
+            options(A, listen=ports[0], certificates=own[0], lease_s=LEASE_S),
+            options(B, listen=ports[1], connect=[ports[0]], certificates=own[1], lease_s=LEASE_S),
+            options(C, connect=[wire.port, ports[1]], certificates=own[2], lease_s=LEASE_S),
+        )
+        async with running(*chosen) as (a, b, c):
+            await meet(a, b, c)
+            c.port.claim(ROBOT, 1)
+            await a.until(lambda: a.told.claims)
+            wire.close_door(cut=how == "cut")
+            await a.until(lambda: C not in a.told.peers and not a.told.claims)
+            await c.until(lambda: A not in c.told.peers)
+            assert set(b.told.peers) == {A, C}
+            assert not c.port.send(A, PriorityClass.CONTROL, b"nobody there")
+            wire.open_door()
+            await a.until(lambda: C in a.told.peers and a.told.claims == {Claim(ROBOT, C, BOOT, 1)})
+            await c.until(lambda: A in c.told.peers)
+            await send_until(c, a, b"again", PriorityClass.CONTROL)
+        wire.open_door()
+
+
+async def test_relays_at_a_router_of_somebody_else() -> None:
+    """Both are its clients, from before it is there, and meet there."""
+    (port,) = free_ports(1)
+    chosen = [options(name, connect=[port], external=True) for name in (A, B)]
+    async with running(*chosen) as (a, b):
+        b.port.claim(ROBOT, 1)
+        with external_router(port):
+            await meet(a, b)
+            await send_until(a, b, b"through the router", PriorityClass.STATE)
+            await a.until(lambda: a.told.claims)
+        await a.until(lambda: not a.told.peers and not a.told.claims)
+
+
+async def test_leaving_while_no_router_answers() -> None:
+    (port,) = free_ports(1)
+    async with running(options(A, connect=[port], external=True)) as (a,):
+        assert not a.port.send(B, PriorityClass.BULK, b"nobody")
+        assert a.port.counters.dropped[FabricDrop.CLOSED] == 1
+
+
+def test_without_zenoh_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "zenoh", None)
+    with pytest.raises(ConfigError, match=r"needs the zenoh library: .* -m pip install eclipse-zenoh"):
+        ZenohPort(options(A, listen=1), Told())
 
 
 async def test_a_port_that_is_taken_is_one_line() -> None:
