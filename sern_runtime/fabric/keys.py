@@ -24,6 +24,8 @@ NO_RULES: Final = "-"
 """In the place of the hash of rules: the relay does not say. No part of a key may be empty."""
 _NUMBER: Final = re.compile(r"0|[1-9][0-9]{0,19}")
 _RULES: Final = re.compile(r"[0-9a-f]{1,128}")
+_ALL: Final = f"{ROOT}/"
+_HOPS: Final = f"{ROOT}/h/"
 RELAY_TOKENS: Final = f"{ROOT}/relay/**"
 CLIENT_TOKENS: Final = f"{ROOT}/at/**"
 
@@ -50,7 +52,7 @@ def client_token(claim: Claim) -> str:
 
 def parse_source(key: str, own: ClientName) -> ClientName | None:
     """Who wrote a datagram for us; None: it is not such a key."""
-    parts = key.removeprefix(f"{ROOT}/h/").split("/")
+    parts = key.removeprefix(_HOPS).split("/") if key.startswith(_HOPS) else ()
     if len(parts) != 3 or parts[0] != own or not is_client_name(parts[1]) or parts[2] not in _CLASSES:
         return None
     return ClientName(parts[1])
@@ -58,7 +60,9 @@ def parse_source(key: str, own: ClientName) -> ClientName | None:
 
 def parse_token(key: str) -> PeerRelay | Claim | None:
     """None: it is no token of ours."""
-    kind, _, rest = key.removeprefix(f"{ROOT}/").partition("/")
+    if not key.startswith(_ALL):
+        return None
+    kind, _, rest = key.removeprefix(_ALL).partition("/")
     parts = rest.split("/")
     if kind == "relay" and len(parts) == 5:
         name, boot, low, high, rules = parts

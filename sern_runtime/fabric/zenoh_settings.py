@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from sern_core.vocabulary.types import ClientName
-from sern_core.wire.framing import VERSIONS, Versions
+from sern_core.wire.framing import MAX_DATAGRAM_BYTES, VERSIONS, Versions
 from sern_runtime.config.fabric import LEASE_S, CertificateFiles
 from sern_runtime.fabric.keys import CLIENT_TOKENS, RELAY_TOKENS, ROOT, inbox
 from sern_runtime.fabric.port import PeerRelay
@@ -31,6 +31,8 @@ queue is also full while the thread that sends takes what is in it (measured: 3 
 WHOLE_BYTES: Final = 65_000
 """The largest datagram that fits one of zenoh's batches (65,535 bytes) with its key and headers. A larger one goes in
 pieces, each of which waits for room of its own."""
+MAX_MESSAGE_BYTES: Final = 2 * MAX_DATAGRAM_BYTES
+"""What a peer may have put together of pieces here; zenoh's default is a gigabyte."""
 QUEUES: Final = (
     "control", "real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background",
 )  # fmt: skip
@@ -90,6 +92,7 @@ def settings(options: FabricOptions) -> Mapping[str, Any]:
         "transport/link/tx/queue/size": dict.fromkeys(QUEUES, QUEUE_BATCHES),
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": WAIT_BEFORE_DROP_US,
         "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": WAIT_BEFORE_DROP_US,
+        "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
         "timestamping/enabled": False,
         "adminspace/enabled": False,
     }

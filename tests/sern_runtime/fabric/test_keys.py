@@ -44,6 +44,12 @@ def test_what_is_no_key_of_ours_is_nobody(text: str) -> None:
             assert keys.client_token(token) == key
 
 
+@pytest.mark.parametrize("key", ["me/you/0", "relay/you/1/1/1/-", "at/robot/you/1/1", "sern/2/h/me/you/0"])
+def test_what_is_under_another_root_is_not_read(key: str) -> None:
+    assert keys.parse_source(key, ClientName("me")) is None
+    assert keys.parse_token(key) is None
+
+
 @pytest.mark.parametrize("name", ["*", "**", "a/b", "a$*", "a#b", "a?x", "", "A", "é", "-"])
 def test_a_name_that_means_something_in_a_key_expression_is_refused(name: str) -> None:
     bad, good = ClientName(name), ClientName("relay")
