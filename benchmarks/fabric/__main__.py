@@ -89,16 +89,16 @@ def _row(directory: Path, start_ns: int, duration_s: float, cpu_s: dict[str, flo
     bulk = arrived[(arrived[:, KIND] == Kind.BULK) & (arrived[:, AT] < until_ns)]
     latencies_ms = (poses[:, AT] - poses[:, STAMP]) / 1e6
     ends = [json.loads((directory / f"{role}.json").read_text()) for role in ("robot", "site")]
-    went, came = (end["port"][what] if end else 0 for end, what in zip(ends, ("sent", "received"), strict=True))
+    lost = {"datagrams_lost_count": ends[0]["port"]["sent"] - ends[1]["port"]["received"]} if all(ends) else {}
     wanted = len(offered[offered[:, KIND] == Kind.POSE])
     return {
         "control_p50_ms": quantile(latencies_ms, 0.5),
         "control_p99_ms": quantile(latencies_ms, 0.99),
         "control_arrives_percent": 100 * len(set(poses[:, NUMBER].tolist())) / wanted,
         "bulk_percent": 100 * 8 * float(bulk[:, SIZE].sum()) / (duration_s - WARM_S) / RATE_BPS,
-        "datagrams_lost_count": went - came,
         "robot_cpu_percent": 100 * cpu_s["robot"] / duration_s,
         "site_cpu_percent": 100 * cpu_s["site"] / duration_s,
+        **lost,
     }
 
 

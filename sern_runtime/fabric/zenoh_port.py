@@ -1,8 +1,8 @@
 """The fabric over zenoh: one session, an inbox, tokens for who is there and where clients are.
 
 zenoh calls from threads of its own. What it says there is put down and the loop is woken, no more: a callback of 20 ms
-would hold up all that the session receives (measured). They are called straight from zenoh's receiving thread, so that
-a relay that does not keep up makes its peers' queues full, where datagrams are dropped by class, and not its memory.
+would hold up all that the session receives (measured). They are called straight from zenoh's receiving thread: another
+thread and a queue of zenoh's in between gained no time (measured), and that queue would not be ours to bound.
 
 Tokens are declared by a thread of ours, in order: zenoh lets a declaration wait for room.
 """
