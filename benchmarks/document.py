@@ -29,6 +29,7 @@ DOCUMENTS: Final = {
     **dict.fromkeys(("mmcf", "mmcf_replay", "mmcf_recovery"), THEORY),
     "summaries": ROOT / "docs" / "summaries.md",
     "spool": ROOT / "docs" / "spool.md",
+    "fabric": ROOT / "docs" / "fabric.md",
     "matrix": ROOT / "docs" / "lab.md",
     **dict.fromkeys(("sync", "sync_lab"), ROOT / "docs" / "twin.md"),
 }

@@ -40,6 +40,7 @@ from sern_runtime import clock, ros_types
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.codec_pool import CodecPool, make_coder
 from sern_runtime.collector import CollectorWatch
+from sern_runtime.config.fabric import FabricSection
 from sern_runtime.config.keys import KeyDirectory, fingerprint
 from sern_runtime.config.load import Loaded
 from sern_runtime.config.relay import RelayFile, load_relay
@@ -61,6 +62,7 @@ from sern_runtime.watching.live import Live
 from sern_runtime.zap import ZapHandler, self_test
 
 if TYPE_CHECKING:
+    from sern_relay.fabric import RelayFabric
     from sern_runtime.http import HttpServer
 
 PATIENCE_S: Final = 5.0
@@ -172,6 +174,7 @@ class RelayDaemon:
         self.server: RelayServer | None = None
         self.keyring: RelayKeyring | None = None
         self.lanes: RelayLanes | None = None
+        self.fabric: RelayFabric | None = None
         self.datagrams = DatagramWatch(
             lambda: list(self.hub.links.values()),
             lambda link, within_s: self.lanes.problem(link, within_s) if self.lanes is not None else None,
@@ -192,6 +195,12 @@ class RelayDaemon:
     def _make_durable(self, disk: Disk) -> DurableHolding:
         known, after = self.admission.known, self._after
         return DurableHolding(disk, self.hub, known=known, now=clock.now, after=after)
+
+    def _make_fabric(self, section: FabricSection) -> "RelayFabric":
+        from sern_relay.fabric import RelayFabric
+
+        model = self.loaded.model
+        return RelayFabric(section, self.loaded.path.parent, self.hub, rules=model.access_rules())
 
     def _own_keys(self) -> OwnKeys | None:
         """The relay's own keys as its files say now. Raises ConfigError."""
@@ -253,6 +262,10 @@ class RelayDaemon:
                     after=self._after,
                     marks=model.link.dscp.marks(),
                 )
+        if model.fabric is not None:
+            with blamed_on(self.loaded.path, "fabric"):
+                self.fabric = self._make_fabric(model.fabric)
+                await self.fabric.start()
         if keys is not None and self.zap is not None:
             await self_test(self._ctx, self.zap, relay.listen, keys.public_key)
             _log.info("self-test passed: a stranger's key is refused on %s", ", ".join(relay.listen))
@@ -301,6 +314,8 @@ class RelayDaemon:
             self.lanes.flush()
         if self.server is not None:
             self.server.flush()
+        if self.fabric is not None:
+            self.fabric.flush()
 
     async def _tick(self) -> None:
         progress = {"socket": lambda: self.server.socket.drains if self.server else 0}
@@ -520,6 +535,8 @@ class RelayDaemon:
                 stack.callback(self.durable.close)
             if self.keyring is not None:
                 stack.push_async_callback(self.keyring.close)
+            if self.fabric is not None:
+                stack.push_async_callback(self.fabric.close)
             stack.callback(self._cancel_flush)
             stack.push_async_callback(end_tasks, self.tasks)
 
@@ -560,6 +577,12 @@ class RelayDaemon:
 
     def fault(self, client: ClientName | None, error: Exception) -> None:
         self.errors.core(error, client or "")
+
+    def peer_up(self, peer: ClientName) -> None:
+        _log.info("connected to the relay %s", peer.removeprefix(PEER_SIGN))
+
+    def peer_down(self, peer: ClientName, reason: str) -> None:
+        _log.warning("not connected to the relay %s: %s", peer.removeprefix(PEER_SIGN), reason)
 
     def client_down(self, client: ClientName, reason: str) -> None:
         self._comings.down(client, reason)

@@ -20,6 +20,7 @@ from sern_runtime.config import keys
 from sern_runtime.config.base import FileModel
 from sern_runtime.config.client import ClientFile
 from sern_runtime.config.endpoints import installing
+from sern_runtime.config.fabric import FabricSection
 from sern_runtime.config.load import Checked, Loaded, check_document
 from sern_runtime.config.relay import RelayFile
 from sern_runtime.config.yaml import Document, read_document
@@ -167,6 +168,15 @@ def _client_summary(out: Console, model: ClientFile) -> None:
     _lines(out, [f"subscribes to {pattern}" for pattern in model.subscribe_patterns()])
 
 
+def _fabric_summary(fabric: FabricSection | None) -> Iterator[str]:
+    if fabric is None:
+        return
+    who = "anyone on this machine" if fabric.relays is None else ", ".join(fabric.relays)
+    yield f"fabric with {who} ({'no encryption' if fabric.certificates is None else 'TLS'})"
+    yield from (f"fabric listens on {locator}" for locator in fabric.listen)
+    yield from (f"fabric connects to {locator}" for locator in fabric.peers)
+
+
 def _relay_summary(out: Console, model: RelayFile) -> None:
     safety = "no encryption" if model.relay.insecure else "CURVE"
     _lines(
@@ -174,6 +184,7 @@ def _relay_summary(out: Console, model: RelayFile) -> None:
         [
             f"relay {model.name}",
             *(f"listens on {endpoint} ({safety})" for endpoint in model.relay.listen),
+            *_fabric_summary(model.fabric),
             f"http {model.http.listen or 'off'}",
         ],
     )

@@ -1,11 +1,14 @@
-"""`sern keygen relay NAME` and `sern keygen client NAME`: make a key pair, and say what to copy where."""
+"""`sern keygen relay NAME` and `sern keygen client NAME`: make a key pair, and say what to copy where.
+
+What `sern keygen fabric` makes is in `keygen_fabric`.
+"""
 
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
-from sern_core.vocabulary.errors import ConfigError, SernError
+from sern_core.vocabulary.errors import ConfigError, SernError, UsageError
 from sern_core.vocabulary.names import client_name
 from sern_core.vocabulary.types import ClientName
 from sern_runtime.config import keys
@@ -87,7 +90,9 @@ Next:
 """
 
 
-app = typer.Typer(help="Make a CURVE key pair for a relay or a client.", no_args_is_help=True)
+app = typer.Typer(
+    help="Make keys: a CURVE pair of a relay or a client, certificates of a fabric.", no_args_is_help=True
+)
 
 _Name = Annotated[str, typer.Argument(help="Name: a lower-case letter, then up to 62 of a-z, 0-9, '_'.")]
 _Out = Annotated[Path, typer.Option("--out", help="Directory for the two files; made if it is not there.")]
@@ -112,6 +117,26 @@ def relay_command(name: _Name, out: _Out = Path(), force: _Force = False) -> Non
 def client_command(name: _Name, out: _Out = Path(), force: _Force = False) -> None:
     """Make the key pair of a client."""
     _command("client", name, out, force)
+
+
+@app.command("fabric")
+def fabric_command(
+    names: Annotated[list[str] | None, typer.Argument(help="The relays, for a new authority.")] = None,
+    relay: Annotated[
+        list[str] | None, typer.Option("--relay", help="Add this relay to the authority in --out.")
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", help="Directory for the files; made if it is not there.")] = Path(),
+) -> None:
+    """Make the certificates by which the relays of one fabric know each other. Nothing is overwritten."""
+    from sern_tools.keygen_fabric import add_relays, make_fabric
+
+    try:
+        if names and relay:
+            raise UsageError("name relays for a new authority, or give --relay NAME to add one to it; not both")
+        typer.echo(add_relays(relay, out=out) if relay else make_fabric(names or (), out=out), nl=False)
+    except SernError as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(EXIT_USER_ERROR) from error
 
 
 if __name__ == "__main__":

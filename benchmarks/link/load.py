@@ -55,11 +55,13 @@ FLOOD_PAUSE_S: Final = 0.002
 
 @dataclass(frozen=True)
 class Load:
-    """Poses at 50 Hz; beside them maps and clouds, unless `cloud_bytes` is 0. With `flood_bps` heartbeats in place of
-    the poses, and messages of the same class beside them. With `even_hz` messages of `even_bytes` alone, as evenly as
-    they can be sent."""
+    """Poses at 50 Hz; beside them clouds, unless `cloud_bytes` is 0, and `maps`. With `flood_bps` heartbeats in place
+    of the poses, and messages of the same class beside them. With `even_hz` messages of `even_bytes` alone, as evenly
+    as they can be sent."""
 
     cloud_bytes: int = 0
+    cloud_hz: float = 10.0
+    maps: bool = True
     seed: int = 1
     flood_bps: float = 0.0
     even_hz: float = 0.0
@@ -71,9 +73,12 @@ class Load:
             return (Flow(Kind.POSE, self.even_hz, self.even_bytes),)
         if self.flood_bps:
             flood = Flow(Kind.FLOOD, self.flood_bps / (8 * FLOOD_BYTES), FLOOD_BYTES)
-            clouds = (Flow(Kind.BULK, 10.0, self.cloud_bytes),) if self.cloud_bytes else ()
-            return (HEARTBEATS, flood, *clouds)
-        return (POSES, MAPS, Flow(Kind.BULK, 10.0, self.cloud_bytes)) if self.cloud_bytes else (POSES,)
+            return (HEARTBEATS, flood, *self._clouds)
+        return (POSES, *((MAPS,) if self.maps else ()), *self._clouds) if self.cloud_bytes else (POSES,)
+
+    @property
+    def _clouds(self) -> tuple[Flow, ...]:
+        return (Flow(Kind.BULK, self.cloud_hz, self.cloud_bytes),) if self.cloud_bytes else ()
 
     def schedule(self, duration_s: float) -> Iterator[tuple[float, Flow, int]]:
         """(seconds since the start, flow, number), in order of time."""

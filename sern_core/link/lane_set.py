@@ -18,14 +18,16 @@ TOLD_CHANGE: Final = 1.5
 
 
 class LaneSet:
-    """`settled` says whether the peer has all that it was told; `give_back` gets what packets carried that did not
-    arrive; `on_rate` gets the rate of the lane that carries data, None: unknown, and whether it was ever full."""
+    """`lossless` and `any_size` are of the lane on which sessions begin (`Lane`). `settled` says whether the peer has
+    all that it was told; `give_back` gets what packets carried that did not arrive; `on_rate` gets the rate of the lane
+    that carries data, None: unknown, and whether it was ever full."""
 
     def __init__(
         self,
         end: End,
         *,
         lossless: bool,
+        any_size: bool | None = None,
         paper: bool,
         settled: Callable[[], bool],
         give_back: Callable[[Lane, list[Any], float], None],
@@ -43,7 +45,7 @@ class LaneSet:
         self._choice_due_s = now
         self.clock = ClockSync()
         """The peer's clock, as the stamps of all lanes tell."""
-        self.lane = Lane(LANE_ZMQ, end.params, lossless=lossless)
+        self.lane = Lane(LANE_ZMQ, end.params, lossless=lossless, any_size=any_size)
         """The lane that carries data now."""
         self.by_id = {LANE_ZMQ: self.lane}
         self.priority_lane: Lane | None = None

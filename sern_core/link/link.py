@@ -62,7 +62,8 @@ class Link:
 
     `towards_relay`: whether the peer is a relay; None: it is if this end says HELLO, which is a client's.
     `definitions` is shared by all links of a process. `auto_confirm`: what had its turn here is delivered; a relay
-    confirms by hand, when its subscribers have.
+    confirms by hand, when its subscribers have. `lossless` and `any_size` say what the lane is on which the session
+    begins (`path.lanes.Lane`).
     """
 
     def __init__(
@@ -79,6 +80,7 @@ class Link:
         trace: DecisionTrace,
         now: float,
         lossless: bool = True,
+        any_size: bool | None = None,
         auto_confirm: bool = True,
         towards_relay: bool | None = None,
     ) -> None:
@@ -108,6 +110,7 @@ class Link:
         lanes = self.lanes = LaneSet(
             end,
             lossless=lossless,
+            any_size=any_size,
             paper=sender.paper,
             settled=self._settled,
             give_back=self._give_back,

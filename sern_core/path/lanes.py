@@ -73,13 +73,22 @@ class Path:
 
 
 class Lane:
-    """State of one lane of one link. `lossless`: a stream (TCP) underneath. `beside`: the lane whose path it shares,
-    until `leave`."""
+    """State of one lane of one link. `lossless`: a stream (TCP) underneath. `any_size`: datagrams may be large, as over
+    a stream, lost or not (None: where nothing is lost). `beside`: the lane whose path it shares, until `leave`."""
 
-    def __init__(self, lane: int, params: LinkParams, *, lossless: bool, beside: "Lane | None" = None) -> None:
+    def __init__(
+        self,
+        lane: int,
+        params: LinkParams,
+        *,
+        lossless: bool,
+        any_size: bool | None = None,
+        beside: "Lane | None" = None,
+    ) -> None:
         self.id = lane
         self.lossless = lossless
-        self.fragment_bytes_max = params.fragment_bytes_max if lossless else DATAGRAM_BYTES
+        self.any_size = lossless if any_size is None else any_size
+        self.fragment_bytes_max = params.fragment_bytes_max if self.any_size else DATAGRAM_BYTES
         self.beside = beside
         """The other lane of the path; None: there is none."""
         self.path: Path = Path(_estimator(params)) if beside is None else beside.path
@@ -121,7 +130,7 @@ class Lane:
         self.fragment_bytes = self._fragment_bytes(None)
 
     def _fragment_bytes(self, rate_bps: float | None) -> int:
-        if not self.lossless:
+        if not self.any_size:
             return DATAGRAM_BYTES
         if rate_bps is None:
             return min(UNKNOWN_RATE_FRAGMENT_BYTES, self.fragment_bytes_max)

@@ -178,7 +178,8 @@ class Hub:
             scheduler=self._scheduler_params,
             trace=self.traces.of(client),
             now=now,
-            lossless=self._lossless,
+            lossless=self._lossless and not is_peer(client),
+            any_size=True if is_peer(client) else None,
             auto_confirm=False,
         )
         link.receiver.on_stray = self.received.stray

@@ -13,7 +13,7 @@ from sern_core.link.handshake import DISPLACED
 from sern_core.link.link import Link
 from sern_core.relay.hub_matching import Matching
 from sern_core.vocabulary.errors import RemoteError, VersionError
-from sern_core.vocabulary.types import ClientName
+from sern_core.vocabulary.types import ClientName, PriorityClass
 from sern_core.wire import framing
 
 RESET_INTERVAL_S: Final = 0.5
@@ -131,6 +131,11 @@ class HubPort:
         if link is None or self.hub.clients.port_of.get(self.client) is not self:
             return None
         return link.next_datagram(now=now)
+
+    @property
+    def priority(self) -> PriorityClass:
+        """The most urgent class in the latest datagram."""
+        return PriorityClass.STATE if self.link is None else self.link.lanes.lane.priority
 
     def next_deadline(self) -> float | None:
         link, hub = self.link, self.hub

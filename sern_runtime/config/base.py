@@ -153,7 +153,7 @@ def described(expected: str) -> WrapValidator:
     return WrapValidator(validate)
 
 
-def _checked(check: Callable[[str], object]) -> AfterValidator:
+def checked(check: Callable[[str], object]) -> AfterValidator:
     """A validator that leaves the text as it is and reports the UsageError of `check`."""
 
     def validate(text: str) -> str:
@@ -244,6 +244,11 @@ def _check_bind(endpoint: str) -> None:
     return _check_port(parts[1])
 
 
+def check_address(text: str, *, bind: bool) -> None:
+    """Raises UsageError where `text` is not `host:port`; `bind`: an address of this host, or `*`, and no name."""
+    (_check_bind if bind else _check_connect)("tcp://" + text)
+
+
 def _check_http(listen: str) -> None:
     parts = split_tcp("tcp://" + listen)
     if parts is None or _address(parts[0]) is None:
@@ -255,17 +260,17 @@ def _shown(text: str) -> str:
     return repr(text if len(text) <= 80 else text[:77] + "...")
 
 
-Pattern = Annotated[str, _checked(compile_pattern), Field(json_schema_extra={"format": "regex"})]
-SelfPattern = Annotated[str, _checked(_check_self_pattern)]
-TopicText = Annotated[str, _checked(topic_name)]
-ClientText = Annotated[str, _checked(client_name)]
-NamespaceText = Annotated[str, _checked(normal_namespace)]
-RoleText = Annotated[str, _checked(_check_phrase)]
-FramePrefix = Annotated[str, _checked(_check_frame_prefix)]
-PathText = Annotated[str, _checked(_check_path)]
-ConnectEndpoint = Annotated[str, _checked(_check_connect)]
-BindEndpoint = Annotated[str, _checked(_check_bind)]
-HttpListen = Annotated[str, _checked(_check_http)]
+Pattern = Annotated[str, checked(compile_pattern), Field(json_schema_extra={"format": "regex"})]
+SelfPattern = Annotated[str, checked(_check_self_pattern)]
+TopicText = Annotated[str, checked(topic_name)]
+ClientText = Annotated[str, checked(client_name)]
+NamespaceText = Annotated[str, checked(normal_namespace)]
+RoleText = Annotated[str, checked(_check_phrase)]
+FramePrefix = Annotated[str, checked(_check_frame_prefix)]
+PathText = Annotated[str, checked(_check_path)]
+ConnectEndpoint = Annotated[str, checked(_check_connect)]
+BindEndpoint = Annotated[str, checked(_check_bind)]
+HttpListen = Annotated[str, checked(_check_http)]
 
 Seconds = Annotated[float, Field(gt=0, le=1e7)]
 SecondsOrZero = Annotated[float, Field(ge=0, le=1e7)]

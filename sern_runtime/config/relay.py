@@ -40,6 +40,7 @@ from sern_runtime.config.base import (
     resolve,
     socket_problems,
 )
+from sern_runtime.config.fabric import FabricSection
 from sern_runtime.config.keys import KeyDirectory
 from sern_runtime.config.load import Loaded, load
 from sern_runtime.config.shared import (
@@ -291,6 +292,8 @@ class RelayFile(FileModel):
     """The relay itself."""
     access: tuple[AccessSection, ...] = ()
     """Who may do what, first match wins. Without rules nobody may do anything."""
+    fabric: FabricSection | None = None
+    """Other relays that this one forms a fabric with; null: it is alone."""
     feed: FeedSection = FeedSection()
     """Plain ZMQ for programs on the local network."""
     replay: ReplaySection = ReplaySection()
@@ -382,6 +385,8 @@ class RelayFile(FileModel):
         yield from output_problems(base_dir, self.summary, ("summary",))
         if self.durable is not None:
             yield from self.durable.problems(base_dir)
+        if self.fabric is not None:
+            yield from self.fabric.problems(base_dir, self.name)
         if self.relay.secret_key_file is not None:
             loc = ("relay", "secret_key_file")
             yield from secret_key_problems(base_dir, self.relay.secret_key_file, loc, owner=self.name)

@@ -28,6 +28,7 @@ def test_what_no_file_asked_for_is_not_imported(program: str) -> None:
         not {"aiohttp", "foxglove", "zenoh", "cyclonedds", "rclpy", "matplotlib", "rosbags.rosbag1", "rosbags.rosbag2"}
         & there
     )
+    assert "sern_runtime.fabric.zenoh_port" not in there
     assert "sern_runtime.config.meanings" not in there, "the source is read for schemas, not for a daemon"
 
 

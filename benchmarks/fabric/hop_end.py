@@ -1,0 +1,222 @@
+"""One end of a hop over a fabric port: a bare `Link` and the port beneath it, no relay.
+
+The robot's end announces a stream of each class and offers messages; the site's end takes them all.
+"""
+
+import asyncio
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from benchmarks.link.load import Kind, Load, Log, Orders, Spec, offer, ready
+from sern_core.link.definitions import DefinitionStore
+from sern_core.link.lane_port import LanePort
+from sern_core.link.link import Link
+from sern_core.path.lanes import LANE_ZMQ
+from sern_core.stream.in_stream import InStream
+from sern_core.stream.out_channel import OutChannel
+from sern_core.stream.out_message import OutMessage
+from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.vocabulary.params import LinkParams, SchedulerParams
+from sern_core.vocabulary.trace import DecisionTrace
+from sern_core.vocabulary.types import ClientName, DropReason, Encoding, PriorityClass, TopicName
+from sern_core.wire import framing
+from sern_core.wire.announce import Announcement
+from sern_runtime import clock
+from sern_runtime.config.fabric import CA_FILE, CertificateFiles, certificate_file, key_file
+from sern_runtime.fabric.hop import ANY_SIZE, LOSSLESS, FabricHop
+from sern_runtime.fabric.port import Claim, PeerRelay
+from sern_runtime.fabric.zenoh_port import ZenohPort
+from sern_runtime.fabric.zenoh_settings import FabricOptions
+
+PORT: Final = 7447
+ROBOT: Final = ClientName("robot")
+SITE: Final = ClientName("site")
+HELLO_KIND: Final = bytes([framing.Kind.HELLO])
+POLL_S: Final = 0.02
+VARIANTS: Final = {
+    "fabric": (LOSSLESS, ANY_SIZE),
+    "fabric, 1171 B": (False, False),
+    "fabric, lossless": (True, True),
+}
+"""What the link takes its lane for, by system."""
+
+
+def options(spec: Spec, name: ClientName, other: ClientName) -> FabricOptions:
+    """The site listens, the robot connects, as it would from behind a NAT."""
+    folder = spec.path
+    return FabricOptions(
+        name=name,
+        boot=1,
+        listen=() if spec.sends else (f"tls/{spec.own_address}:{PORT}",),
+        peers=(f"tls/{spec.address}:{PORT}",) if spec.sends else (),
+        relays=(other,),
+        certificates=CertificateFiles(folder / CA_FILE, folder / certificate_file(name), folder / key_file(name)),
+    )
+
+
+class HopEnd:
+    """Owns link, port and pump of one end; is told by both (`LinkHandler`, `FabricEvents`)."""
+
+    def __init__(self, spec: Spec, log: Log) -> None:
+        self._log = log
+        self.own, self.other = (ROBOT, SITE) if spec.sends else (SITE, ROBOT)
+        self.heard_peer = asyncio.Event()
+        self.faults: list[str] = []
+        lossless, any_size = VARIANTS[spec.system]
+        self.link = Link(
+            name=self.own,
+            boot=1,
+            peer=self.other,
+            initiator=spec.sends,
+            handler=self,
+            definitions=DefinitionStore(),
+            link=LinkParams(),
+            scheduler=SchedulerParams(),
+            trace=DecisionTrace(),
+            now=clock.now(),
+            lossless=lossless,
+            any_size=any_size,
+        )
+        self.port = ZenohPort(options(spec, self.own, self.other), self)
+        self.hop = FabricHop(self.port, self.other, _End(self.link))
+
+    def open(self, priority: PriorityClass) -> OutChannel:
+        """A best-effort stream of a class, as a relay would pass it on."""
+        topic = TopicName(f"/robot/{priority.name.lower()}")
+        stream = StreamInfo(
+            StreamId(ROBOT, 1, topic), TopicInfo(topic, "std_msgs/UInt8MultiArray", Encoding.CDR), TopicSpec(priority)
+        )
+        return self.link.outgoing.open(stream, first=1, now=clock.now())
+
+    def submit(self, channel: OutChannel, body: bytes) -> None:
+        now = clock.now()
+        message = Message(channel.stream.id, channel.next_seq, body, time.time_ns(), now)
+        self.link.sender.submit(channel, message, now=now)
+        self.hop.kick()
+
+    def seen(self) -> dict[str, Any]:
+        """What the report wants to know beside the messages."""
+        return {
+            "port": dict(self.port.counters.snapshot()),
+            "datagrams": self.hop.datagrams,
+            "rtt_s": self.link.rtt_s,
+            "rate_bps": self.link.lane.estimator.rate_bps,
+            "acked": self.link.lane.acked_packets,
+            "lost": self.link.lane.lost_packets,
+            "fragment_bytes": self.link.lane.fragment_bytes,
+            "faults": self.faults,
+        }
+
+    # --- FabricEvents -------------------------------------------------------------------------------------------------
+
+    def peer_up(self, peer: PeerRelay) -> None:
+        del peer
+        self.link.connected(now=clock.now())
+        self.hop.kick()
+
+    def peer_down(self, name: ClientName, boot: int) -> None:
+        del name, boot
+        self.link.disconnected(now=clock.now())
+
+    def claimed(self, claim: Claim) -> None:
+        """Nobody claims anything here."""
+
+    def released(self, claim: Claim) -> None:
+        """Nor releases."""
+
+    def arrived(self, source: ClientName, datagram: bytes) -> None:
+        del source
+        self.hop.arrived(datagram)
+
+    # --- LinkHandler --------------------------------------------------------------------------------------------------
+
+    def on_announce(self, link: Link, announcement: Announcement, *, now: float) -> bool:
+        del link, announcement, now
+        return True
+
+    def on_message(self, link: Link, stream: InStream, message: Message, *, now: float) -> None:
+        del link, stream, now
+        self._log.arrived(message.body)
+
+    def on_fault(self, link: Link, error: Exception, *, now: float) -> None:
+        del link, now
+        self.faults.append(repr(error))
+
+    def on_down(self, link: Link, reason: str, *, now: float) -> None:
+        del link, now
+        self.faults.append(f"down: {reason}")
+
+    def on_up(self, link: Link, *, resumed: bool, now: float) -> None: ...
+    def on_lane_closed(self, link: Link) -> None: ...
+    def on_rejected(self, link: Link, code: str, text: str, *, now: float) -> None: ...
+    def on_retract(self, link: Link, stream: InStream, *, now: float) -> None: ...
+    def on_in_drop(self, link: Link, stream: InStream, reason: DropReason, nbytes: int, count: int) -> None: ...
+    def on_out_drop(self, link: Link, channel: OutChannel, outs: Sequence[OutMessage], reason: DropReason) -> None: ...
+    def on_delivered(self, link: Link, channel: OutChannel, *, now: float) -> None: ...
+    def on_wanted(self, link: Link, channel: OutChannel, *, now: float) -> None: ...
+    def on_refused(self, link: Link, channel: OutChannel, code: str, text: str, *, now: float) -> None: ...
+    def on_skipped(self, link: Link, stream: InStream, count: int, *, now: float) -> None: ...
+    def on_definition(self, link: Link, digest: str, *, now: float) -> None: ...
+    def on_control(self, link: Link, envelope: framing.Envelope, attachment: bytes, *, now: float) -> None: ...
+
+
+class _End(LanePort):
+    """The end that is spoken to also takes the HELLO."""
+
+    def __init__(self, link: Link) -> None:
+        super().__init__(link, LANE_ZMQ)
+
+    def receive(self, data: bytes, *, now: float) -> None:
+        if data[2:3] == HELLO_KIND:
+            header = framing.decode_header(data)
+            self.link.accept(framing.decode_handshake(data), header.tag, header.stamp_us, now=now)
+        else:
+            super().receive(data, now=now)
+
+
+def sender(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str, Any]:
+    return asyncio.run(_send(spec, load, orders, log))
+
+
+async def _send(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str, Any]:
+    end = HopEnd(spec, log)
+    await end.port.start()
+    channels = {Kind(priority): end.open(priority) for priority in PriorityClass}
+    ready()
+    for pause_s in offer(load, spec.duration_s, orders, log, lambda kind, body: end.submit(channels[kind], body)):
+        await asyncio.sleep(pause_s)
+    return await _stop(end)
+
+
+def receiver(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str, Any]:
+    del load
+    return asyncio.run(_receive(spec, orders, log))
+
+
+async def _receive(spec: Spec, orders: Orders, log: Log) -> dict[str, Any]:
+    end = HopEnd(spec, log)
+    await end.port.start()
+    said = False
+    while not orders.stopped:
+        await asyncio.sleep(POLL_S)
+        if log.heard and not said:
+            said = True
+            ready()
+        orders.poll()
+    return await _stop(end)
+
+
+async def _stop(end: HopEnd) -> dict[str, Any]:
+    seen = end.seen()
+    end.hop.close()
+    await end.port.close()
+    return seen
+
+
+def certificates(directory: Path) -> None:
+    """Of both ends, in the folder of a run."""
+    from sern_tools.keygen_fabric import make_fabric
+
+    make_fabric([ROBOT, SITE], out=directory)
