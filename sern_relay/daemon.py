@@ -23,6 +23,7 @@ from sern_core.topics.rules import FeedRole
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.key_news import ClientKeys
 from sern_core.vocabulary.message import Message, StreamInfo
+from sern_core.vocabulary.names import PEER_SIGN
 from sern_core.vocabulary.types import ClientName
 from sern_relay.admission import ZAP_DOMAIN, Admission, read_directory
 from sern_relay.comings import Comings
@@ -360,7 +361,7 @@ class RelayDaemon:
     async def _tell_objects(self) -> None:
         while True:
             await asyncio.sleep(PERIOD_S)
-            if self.hub.exchange.feeds:
+            if self.hub.exchange.feeds or self.hub.peers.names:
                 self.hub.tell_objects(now=clock.now())
 
     def _status(self) -> str:

@@ -39,7 +39,8 @@ def asking(
 
     site = Told()
     links = {ClientName(name): Told() for name in others} | {ClientName("site"): site}
-    presence = Presence(links, set(), matching, attempt, lambda: None, PeerLimits(told_at_once=told_at_once))
+    limits = PeerLimits(told_at_once=told_at_once)
+    presence = Presence(links, set(), matching, attempt, lambda: None, limits, home=lambda _client: None)
     presence.watch(ClientName("site"), now=0.0)
     return presence, site, links
 

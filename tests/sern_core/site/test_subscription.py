@@ -18,8 +18,8 @@ class Session:
 
     def __init__(self) -> None:
         end = End(
-            name=ClientName("site"), boot=1, peer=ClientName("relay"), initiator=True, params=LinkParams(),
-            trace=DecisionTrace(enabled=False), now=0.0,
+            name=ClientName("site"), boot=1, peer=ClientName("relay"), initiator=True, towards_relay=True,
+            params=LinkParams(), trace=DecisionTrace(enabled=False), now=0.0,
         )  # fmt: skip
         end.established = True
         self.control = ControlStream(end, Reassembly(2**20, end.params.limits), lambda _message: None)
