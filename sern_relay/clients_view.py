@@ -18,6 +18,7 @@ from typing import Any, Final
 
 from sern_core.link.link import Link
 from sern_core.relay.hub import Hub
+from sern_core.vocabulary.names import is_peer
 from sern_core.vocabulary.types import ClientName
 from sern_relay.admission import Admission
 from sern_relay.comings import Coming, Comings
@@ -43,7 +44,8 @@ class ClientsSource:
 
     def names(self) -> list[ClientName]:
         """Everybody who is known."""
-        return sorted({*self.admission.names, *self.hub.links, *self.comings.clients})
+        names = {*self.admission.names, *self.hub.links, *self.comings.clients}
+        return sorted(name for name in names if not is_peer(name))
 
 
 def clients_view(source: ClientsSource) -> JsonParts:

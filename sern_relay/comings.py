@@ -8,6 +8,7 @@ from typing import Final
 
 from sern_core.link.handshake import DISPLACED
 from sern_core.link.link import Link
+from sern_core.vocabulary.names import is_peer
 from sern_core.vocabulary.types import ClientName
 from sern_runtime import clock
 from sern_runtime.events import EventLog
@@ -103,6 +104,8 @@ class Comings:
         """Say which client has been silent for a while in a session that goes on, and when it is not any more; and
         who is waited for no longer."""
         for client, link in links.items():
+            if is_peer(client):
+                continue  # it is no client
             if not link.established:
                 continue
             self._outages.look(

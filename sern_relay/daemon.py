@@ -50,6 +50,7 @@ from sern_runtime.draining import Progress
 from sern_runtime.durable.disk import Disk
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.events import EventLog
+from sern_runtime.fabric.port import FabricCounters
 from sern_runtime.http_routes import Health
 from sern_runtime.internal_errors import InternalErrors
 from sern_runtime.loop import Shutdown
@@ -177,7 +178,7 @@ class RelayDaemon:
         self.lanes: RelayLanes | None = None
         self.fabric: RelayFabric | None = None
         self.datagrams = DatagramWatch(
-            lambda: list(self.hub.links.values()),
+            self.hub.clients.of_clients,
             lambda link, within_s: self.lanes.problem(link, within_s) if self.lanes is not None else None,
             lambda link: link.peer,
         )
@@ -379,7 +380,12 @@ class RelayDaemon:
 
     def clients_up(self) -> int:
         """Clients with a session."""
-        return sum(link.established for link in self.hub.links.values())
+        return sum(link.established for link in self.hub.clients.of_clients())
+
+    @property
+    def fabric_counters(self) -> FabricCounters | None:
+        """Of the port to other relays; None: it is not there yet."""
+        return None if self.fabric is None else self.fabric.port.counters
 
     def reload(self) -> None:
         """SIGHUP: read keys, access rules and the feed's roles anew; all or nothing. What was revoked ends now."""
@@ -440,7 +446,7 @@ class RelayDaemon:
 
         registry = CollectorRegistry()
         metrics = Metrics(registry)
-        register_relay(metrics, self)
+        register_relay(metrics, self, fabric=self.loaded.model.fabric is not None)
         server = HttpServer(
             listen,
             registry,

@@ -16,6 +16,8 @@ from sern_runtime.adaptation import Adaptation
 from sern_runtime.collector import CollectorWatch
 from sern_runtime.datagram_watch import DatagramWatch
 from sern_runtime.durable.durable_metrics import register_durable
+from sern_runtime.fabric.metrics import register_fabric
+from sern_runtime.fabric.port import FabricCounters
 from sern_runtime.internal_errors import InternalErrors
 from sern_runtime.link_metrics import register_codecs, register_links, register_received
 from sern_runtime.metrics import Metrics
@@ -46,12 +48,16 @@ class Counting(Protocol):
     def refusals(self) -> Mapping[str, int]:
         """Refusals by code."""
 
+    @property
+    def fabric_counters(self) -> FabricCounters | None:
+        """Of the port to other relays; None: it is not there yet."""
+
     def clients_up(self) -> int:
         """Clients with a session."""
 
 
-def register_relay(metrics: Metrics, relay: Counting) -> None:
-    """Have `metrics` read all of them."""
+def register_relay(metrics: Metrics, relay: Counting, *, fabric: bool = False) -> None:
+    """Have `metrics` read all of them. `fabric`: the relay's file has one."""
     hub = relay.hub
     register_links(metrics, lambda: list(hub.links.values()), hub.clients.given_up.counters)
     relay.datagrams.register(metrics)
@@ -61,6 +67,8 @@ def register_relay(metrics: Metrics, relay: Counting) -> None:
     register_durable(metrics, None if relay.durable is None else relay.durable.disk)
     relay.collector.register(metrics)
     relay.parts.register(metrics)
+    if fabric:
+        register_fabric(metrics, lambda: relay.fabric_counters)
     if relay.adaptation is not None:
         relay.adaptation.register(metrics)
     metrics.gauge("sern_relay_clients", "Clients with a session.",

@@ -81,6 +81,10 @@ class Clients:
         self.port_of[port.client] = port
         self._absent_since.pop(port.client, None)
 
+    def of_clients(self) -> list[Link]:
+        """The links of all but other relays."""
+        return [link for name, link in self.links.items() if not is_peer(name)]
+
     def call(self, port: HubPort, *, now: float) -> None:
         """Say hello on a connection to another relay."""
         older = self.port_of.get(port.client)

@@ -22,6 +22,8 @@ from sern_client.navigation.metrics import register_navigation
 from sern_client.navigation.node import NavigationNode
 from sern_client.navigation.options import NodeOptions
 from sern_core.vocabulary.types import DropReason, Encoding
+from sern_runtime.fabric.metrics import register_fabric
+from sern_runtime.fabric.port import FabricCounters
 from sern_runtime.metrics import Metrics
 from sern_twin.world.grid import Grid
 from tests.daemons import Lab, write_bag
@@ -78,6 +80,13 @@ def viewers() -> str:
     return generate_latest(registry).decode()
 
 
+def fabric() -> str:
+    """What a relay says of its port to other relays."""
+    registry = CollectorRegistry()
+    register_fabric(Metrics(registry), FabricCounters)
+    return generate_latest(registry).decode()
+
+
 @pytest.fixture(scope="module")
 def metrics(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
     """Sample name -> labels, of a relay with a robot and a site, of twins, and of a node that navigates. A family
@@ -103,7 +112,7 @@ def metrics(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
             return [process.get("/metrics")[1] for process in (relay, site, robot, twin)]
 
     found: dict[str, set[str]] = {}
-    for text in (*asyncio.run(collect()), navigation(), viewers()):
+    for text in (*asyncio.run(collect()), navigation(), viewers(), fabric()):
         for family in text_string_to_metric_families(text):
             name = family.name + ("_total" if family.type == "counter" else "")
             found.setdefault(name, {"?"})

@@ -68,7 +68,10 @@ def test_relays_ask_for_what_their_clients_want_and_no_more() -> None:
         robot.publish(topic, spec(PriorityClass.STATE))
     site = world.client_at("b", "site", patterns=["/robot/o.*"])
     world.run(1.0)
-    streams = lambda: sorted(identity.topic for identity in world.relays["b"].hub.relayed)  # noqa: E731
+
+    def streams() -> list[str]:
+        return sorted(identity.topic for identity in world.relays["b"].hub.relayed)
+
     assert streams() == ["/robot/odom"]
     site.subscribe("/robot/scan")
     world.run(1.0)
