@@ -280,8 +280,8 @@ class Lab:
     # --- daemons ----------------------------------------------------------------------------------------------------
 
     def process(self, config: Path, *, before: Sequence[str] = ()) -> Process:
-        """Start a daemon in a process of its own; the relay's file is relay.yaml."""
-        program = "relay" if config.stem == "relay" else "client"
+        """Start a daemon in a process of its own; the file of a relay is relay.yaml, or that with a number."""
+        program = "relay" if config.stem.rstrip("0123456789") == "relay" else "client"
         process = Process(config.stem, program, config, before=before)
         self._processes.append(process)
         return process

@@ -235,8 +235,8 @@ class Hub:
 
     def left(self, client: ClientName, *, now: float) -> None:
         """A client has said goodbye. One that has streams, or wants reliable ones, may come back to them (a daemon that
-        is started anew), and is waited for like any other; the others are forgotten. So is one that goes on at another relay,
-        once nobody here needs what is kept of it."""
+        is started anew), and is waited for like any other; the others are forgotten. So is one that goes on at another
+        relay, once nobody here needs what is kept of it."""
         channels = self.links[client].sender.channels.values()
         if not self.routing.streams_of(client) and not any(channel.reliable for channel in channels):
             self._forget(client, now)
