@@ -31,6 +31,7 @@ PATIENCE_S: Final = 2.0
 STALL_PATIENCE_S: Final = 5.0
 """The same while it has more to send and a session: a path that has stalled often comes back."""
 PATIENCE_RTTS: Final = 4.0
+SETTLE_S: Final = 0.1
 LINGER_S: Final = 1.0
 """How long the goodbye, and what is confirmed before it, may take to leave this machine."""
 
@@ -208,11 +209,12 @@ class Connection:
         if unconfirmed:
             _log.warning("stopping with %d reliable messages that not everyone has confirmed", unconfirmed)
 
-    async def settle(self, *, limit_s: float) -> None:
-        """Wait for a moment in which nothing of what is reliable is under way, `limit_s` at most. What is offered
-        meanwhile goes on as ever."""
+    async def settle(self) -> None:
+        """Wait for a moment in which nothing of what is reliable is under way, some round trips at most: it may be for
+        a client that has gone. Nothing is lost without such a moment: something is sent twice then, and dropped where
+        it arrives. What is offered meanwhile goes on as ever."""
         link = self._core.link
-        give_up_s = clock.now() + limit_s
+        give_up_s = clock.now() + SETTLE_S + PATIENCE_RTTS * link.lane.flight.rtt.srtt_s
         while link.established and not link.lane.stalled and clock.now() < give_up_s:
             channels = link.sender.channels.values()
             if not any(channel.reliable and any(out.started for out in channel.retained) for channel in channels):

@@ -32,10 +32,11 @@ from sern_runtime.metrics import Metrics
 from sern_runtime.transport_watch import NOT_YET
 from sern_runtime.zmq_setup import CurvePair
 
-LOOK_S: Final = 0.5
-SETTLE_S: Final = 2.0
-"""How long a client that goes back waits for a moment in which nothing reliable is under way. It loses nothing without
-one: it is only that something is sent twice then, and dropped where it arrives."""
+LOOK_S: Final = 0.25
+WHY: Final = {
+    MoveReason.RETURN: "that one answers again, and is preferred",
+    MoveReason.FOLLOW: "that one is preferred, and a peer has gone back",
+}
 
 _log = logging.getLogger(__name__)
 
@@ -165,7 +166,12 @@ class Relays:
                 self._ask(entry)
             else:
                 self._ask_no_more(entry)
-        move = self.choice.look(now, answers=self._answers(), letting_in=self.connection.letting_in)
+        move = self.choice.look(
+            now,
+            answers=self._answers(),
+            letting_in=self.connection.letting_in,
+            left_behind=bool(self._core.peers.moved),
+        )
         self._looked_s = now
         if move is not None and not self._staying:
             await self._go(move)
@@ -232,9 +238,9 @@ class Relays:
 
     async def _go(self, move: Move) -> None:
         old, new = self.current, self.entries[move.to]
-        if move.reason is MoveReason.RETURN:
+        if move.reason is not MoveReason.SILENT:
             why = f"it goes back to relay {new.words}"
-            await self.connection.settle(limit_s=SETTLE_S)
+            await self.connection.settle()
             if self._staying:
                 return
             self.news.leaves(why)
@@ -273,7 +279,7 @@ class Relays:
         entry.name, entry.why = self._core.link.peer, ""
         if entry is not before:
             self.moves[entry.address, str(self._reason)] += 1
-            why = "that one answers again, and is preferred" if self._reason is MoveReason.RETURN else before.why
+            why = WHY.get(self._reason, before.why)
             between = [f"{each.words}: {each.why}" for each in self._tried if each not in (before, entry)]
             words = "moved from relay %s to %s: %s"
             self._events.say(
@@ -369,7 +375,7 @@ class Relays:
         )
         metrics.counter(
             "sern_client_failovers_total",
-            "Times the client had a session at another relay than before, by that one and why: silent, return.",
+            "Times the client had a session at another relay than before, by that one and why: silent, return, follow.",
             ("relay", "reason"),
             lambda: [(labels, float(count)) for labels, count in self.moves.items()],
         )

@@ -394,6 +394,11 @@ def valid() -> list[Vector]:
             },
         ),
         _control(
+            "peers-moved",
+            "jackal1 has gone to another relay",
+            {"t": "peers", "peers": [{"name": "jackal1", "up": False, "for": 0.0, "lane": "udp", "moved": True}]},
+        ),
+        _control(
             "subscribe-known",
             "an earlier part, in which a client asks of two that it knows",
             {"t": "subscribe", "patterns": [], "more": True, "known": ["jackal2", "jackal3"]},

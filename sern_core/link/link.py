@@ -354,6 +354,11 @@ class Link:
         return self.end.established
 
     @property
+    def moved(self) -> bool:
+        """Whether the peer has ended the session because it goes on at another relay."""
+        return self.handshake.moved
+
+    @property
     def dirty(self) -> bool:
         """Whether something may be sendable: the owner should poll `next_datagram`."""
         return self.end.dirty

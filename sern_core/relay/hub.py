@@ -240,7 +240,7 @@ class Hub:
         channels = self.links[client].sender.channels.values()
         if not self.routing.streams_of(client) and not any(channel.reliable for channel in channels):
             self._forget(client, now)
-        elif self.links[client].handshake.moved:
+        elif self.links[client].moved:
             self.moved.add(client)
 
     def forget(self, client: ClientName, reason: str, *, now: float) -> None:

@@ -2,7 +2,8 @@
 
 The order of the list is the order of preference. A relay that does not answer for a while is left for the next one in
 the list, and the last is followed by the first. A relay before the one that the client is at is asked now and then, and
-when it has answered for long enough without interruption the client goes back to it.
+when it has answered for long enough without interruption the client goes back to it. So it does at once when one of its
+peers has gone: they find it at different times, and have no use of each other at different relays.
 
 Time counts in looks, each for so much at most: of a process that stood still no relay was silent.
 """
@@ -23,6 +24,8 @@ class MoveReason(StrEnum):
     """The one it is at did not answer."""
     RETURN = "return"
     """One that it prefers answers again."""
+    FOLLOW = "follow"
+    """A peer has gone back, and a relay that is preferred answers here, too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +38,7 @@ class Move:
 
 class RelayChoice:
     """`patience_s` has, for each relay of the list, how long it may take to let a connection in that it has begun to
-    let in. Call `look` about twice a second, and do what it says; `moved` when that is done."""
+    let in. Call `look` some times a second, and do what it says; `moved` when that is done."""
 
     def __init__(self, patience_s: Sequence[float], *, failover_s: float, return_s: float, now: float) -> None:
         self._patience_s = tuple(patience_s)
@@ -70,15 +73,18 @@ class RelayChoice:
             self._since_s[place] = now
         self._heard_s[place] = now
 
-    def look(self, now: float, *, answers: bool, letting_in: bool) -> Move | None:
+    def look(self, now: float, *, answers: bool, letting_in: bool, left_behind: bool = False) -> Move | None:
         """What to do now. `answers`: the relay at which the client is, since the last look or lately enough.
-        `letting_in`: it has begun to let the first connection in, and has not ended that."""
+        `letting_in`: it has begun to let the first connection in, and has not ended that. `left_behind`: a peer has
+        gone from that relay to another one."""
         elapsed_s, self._looked_s = min(max(0.0, now - self._looked_s), MAX_LOOK_S), now
         self._silent_s = 0.0 if answers else self._silent_s + elapsed_s
         for place in self.better:
             answering_s = self.answering_s(place, now)
             if answering_s is not None and answering_s >= self._return_s:
                 return Move(place, MoveReason.RETURN)
+            if answering_s is not None and left_behind:
+                return Move(place, MoveReason.FOLLOW)
         count = len(self._patience_s)
         patience_s = max(self._failover_s, self._patience_s[self.at]) if letting_in else self._failover_s
         if count > 1 and self._silent_s >= patience_s:

@@ -138,6 +138,15 @@ def test_the_first_of_those_that_answer_is_the_one_to_return_to() -> None:
     assert asked(both, 0.0, 1000.0, 0, 1)[1] == Move(0, MoveReason.RETURN)
 
 
+def test_one_that_is_left_behind_by_a_peer_follows_where_a_preferred_relay_answers() -> None:
+    choice = at(2)
+    assert choice.look(0.5, answers=True, letting_in=False, left_behind=True) is None, "nobody says where it has gone"
+    choice.answered(1, 1.0)
+    assert choice.look(1.0, answers=True, letting_in=False) is None
+    assert choice.look(1.5, answers=True, letting_in=False, left_behind=True) == Move(1, MoveReason.FOLLOW)
+    assert choice.look(4.0, answers=True, letting_in=False, left_behind=True) is None, "it does not answer any more"
+
+
 def test_who_has_answered_before_a_move_has_to_do_so_anew() -> None:
     choice = at(1)
     now, _ = asked(choice, 0.0, 200.0, 0)

@@ -155,6 +155,20 @@ def test_a_client_that_others_here_do_not_need_is_forgotten_though_they_stay() -
     assert relays.remembered(A) == {"robot", "site"}
 
 
+def test_who_is_left_behind_is_told_that_its_peer_has_moved() -> None:
+    relays = Relays("robot", "site")
+    playing(relays)
+    peers = relays.clients["site"].core.peers
+    assert not peers.moved
+    relays.move("robot", B)
+    relays.world.until(lambda: peers.moved == {"robot"}, within_s=0.5)
+    relays.move("site", B)
+    assert not peers.moved
+    relays.move("robot", A, clean=False)
+    relays.world.run(2.0)
+    assert not peers.moved, "that one may be back at any time"
+
+
 def test_a_client_that_breaks_off_is_waited_for_as_ever() -> None:
     relays = Relays("robot", "site")
     playing(relays)
