@@ -144,6 +144,7 @@ class _Situation:
         self._wants: list[str] = row.get("subscribed", [])
         self._stays: list[str] = row.get("stays_here", [])
         self._set: Json = row.get("by_hand", {})
+        self._at: Json = row.get("relay", {})
         self._summaries = {
             item["stream"].rpartition(f"/{item['kind']}")[0] or item["stream"]: item
             for item in row.get("summaries", ())
@@ -285,6 +286,7 @@ class _Situation:
             some = ", ".join(self._stays[:3]) + (", ..." if len(self._stays) > 3 else "")
             yield NOTE, f"stays here, as no rule in `topics` names it: {some}"
         yield from _by_hand(self._set)
+        yield from _at_relay(self._at)
         names = {literal(pattern) for pattern in self._wants}
         for text in self._denied:
             if not any(name in text.replace(":", " ").split() for name in names if name):
@@ -308,6 +310,20 @@ def _by_hand(said: Json) -> Iterator[Word]:
         yield NOTE, f"set by hand: {more} more topics; `sern set` lists them"
     if said.get("profile"):
         yield NOTE, f"set by hand: profile {said['profile']}"
+
+
+def _at_relay(said: Json) -> Iterator[Word]:
+    """At which of several relays a client is."""
+    if len(said.get("relays", ())) < 2:
+        return
+    moves = f"; it moved {said['moves']} times" if said["moves"] else ""
+    where = f"{said['name']}, {said['address']}" if said["name"] else said["address"]
+    if said["preferred"]:
+        yield NOTE, f"at the preferred relay ({where}){moves}"
+        return
+    first = said["relays"][0]
+    answers = f"has answered for {span(first['answering_s'])}" if first["answering_s"] is not None else first["why"]
+    yield WARN, f"at another relay ({where}) than the preferred one, {first['address']}: {answers}{moves}"
 
 
 def literal(pattern: str) -> str | None:
