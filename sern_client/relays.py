@@ -377,5 +377,9 @@ class Relays:
             "sern_client_failovers_total",
             "Times the client had a session at another relay than before, by that one and why: silent, return, follow.",
             ("relay", "reason"),
-            lambda: [(labels, float(count)) for labels, count in self.moves.items()],
+            lambda: [
+                ((each.address, str(reason)), float(self.moves[each.address, str(reason)]))
+                for each in (self.entries if self.several else ())  # from 0 on: else the first would be no increase
+                for reason in MoveReason
+            ],
         )

@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from prometheus_client import CollectorRegistry, generate_latest
 from rosbags.typesys import Stores, get_typestore
 
 from sern_client.daemon import ClientDaemon
 from sern_core.vocabulary.types import ClientName
 from sern_runtime.config.keys import PublicKey, PublicKeys, write_public
+from sern_runtime.metrics import Metrics
 from sern_tools.harness.files import relay_content, write
 from sern_tools.keygen import write_pair
 from sern_tools.ports import free_ports
@@ -100,6 +102,13 @@ def why(client: ClientDaemon, which: int) -> str:
     return str(view["relays"][which]["why"])
 
 
+def registry_of(client: ClientDaemon) -> CollectorRegistry:
+    """The metrics of its relays."""
+    registry = CollectorRegistry()
+    client.relays.register(Metrics(registry))
+    return registry
+
+
 def moves(client: ClientDaemon, which: int, reason: str) -> int:
     return client.relays.moves[client.relays.entries[which].address, reason]
 
@@ -159,6 +168,13 @@ async def test_a_relay_with_another_key_is_left_out_and_that_is_said_once(
         robot = await lab.client(two.robot_file(relay1={"server_key_file": "wrong.pub"}))
         await arrive(B, robot)
         said = [record.getMessage() for record in caplog.records if "its key is not the one" in record.getMessage()]
+        metrics = generate_latest(registry_of(robot)).decode()
+        row = 'sern_client_failovers_total{reason="%s",relay="%s"} %s'
+        for reason, which, count in (("silent", B, "1.0"), ("silent", A, "0.0"), ("return", A, "0.0")):
+            assert row % (reason, two.addresses[which], count) in metrics
+        assert [f'sern_client_at_relay{{relay="{two.addresses[which]}"}} {which}.0' in metrics for which in (A, B)] == [
+            True
+        ] * 2
         assert said and len(said) == len(set(said)), "a reason is said once, however often it is tried"
         await until(lambda: "its key is not the one" in why(robot, A), "it is asked again, and refused")
         assert robot.relays.choice.answering_s(A, robot.core.link.now) is None
