@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Final, Self
 
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import Discriminator, Field, Tag, ValidationInfo, field_validator, model_validator
 
 from sern_core.site.object_mirror import Selection
 from sern_core.site.services import ServiceRule, subscriptions
@@ -275,12 +275,12 @@ class ClientFile(FileModel):
 
     client: ClientSection
     """Who this client is."""
-    relay: RelayConnection | None = None
-    """The relay it connects to. Either this or `relays`."""
     relays: Annotated[tuple[RelayConnection, ...], Field(min_length=1, max_length=MAX_RELAYS)] | None = None
     """In place of `relay`: several, each as that section, in the order of preference. The client is at one of them;
     when that does not answer it goes to the next (see `failover`). Whoever is to hear of each other must go to the same
     one: give all clients the same list."""
+    relay: Annotated[RelayConnection | None, Field(validate_default=True)] = None
+    """The relay it connects to. Either this or `relays`."""
     failover: FailoverSection = FailoverSection()
     """When it goes from one of `relays` to another; of no use with one relay."""
     endpoint: Annotated[
@@ -341,25 +341,26 @@ class ClientFile(FileModel):
             return f"is a relay's file, which sern-relay reads; {needed}"
         return None
 
-    @model_validator(mode="after")
-    def _one_way_to_its_relays(self) -> "ClientFile":
-        if self.relays is None:
-            if self.relay is None:
-                raise fault("is missing; or write relays, a list of several", "relay")
-            return self
-        if self.relay is not None:
-            raise fault("has no use with relay; put that relay into the list, the preferred one first", "relays")
+    @field_validator("relays")
+    @classmethod
+    def _each_has_its_address(cls, relays: tuple[RelayConnection, ...] | None) -> tuple[RelayConnection, ...] | None:
         seen: dict[str, int] = {}
-        for index, each in enumerate(self.relays):
+        for index, each in enumerate(relays or ()):
             before = seen.setdefault(each.endpoint, index)
             if before != index:
-                raise fault(
-                    f"is that of relays.{before}, too; each relay has an address of its own",
-                    "relays",
-                    index,
-                    "endpoint",
-                )
-        return self
+                text = f"is that of relays.{before}, too; each relay has an address of its own"
+                raise fault(text, index, "endpoint")
+        return relays
+
+    @field_validator("relay")
+    @classmethod
+    def _one_or_several(cls, relay: RelayConnection | None, info: ValidationInfo) -> RelayConnection | None:
+        relays = info.data.get("relays", ())  # of a list that is wrong it is said what is
+        if relay is None and relays is None:
+            raise fault("is missing; or write relays, a list of several")
+        if relay is not None and relays is not None:
+            raise fault("has no use with relays; put it into that list, the preferred one first")
+        return relay
 
     @model_validator(mode="after")
     def _rules_fit(self) -> "ClientFile":
