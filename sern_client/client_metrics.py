@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING
 
 from sern_client.bridge import Bridge
 from sern_client.checks import TableCheck
-from sern_client.connection import Connection
 from sern_client.endpoints.base import CountingEndpoint, MeasuredEndpoint
 from sern_client.guard import Guard
 from sern_client.link_state import LinkState
 from sern_client.operating import Operating
+from sern_client.relays import Relays
 from sern_client.spool.spool_metrics import register_spool
 from sern_client.summaries.client_summaries import register_summaries
 from sern_runtime.adaptation import Adaptation
@@ -28,7 +28,7 @@ class Counting:
     """The parts of a client that count. None: the client has none."""
 
     bridge: Bridge
-    connection: Connection
+    relays: Relays
     link_state: LinkState
     check: TableCheck
     guard: Guard | None
@@ -52,7 +52,8 @@ def _register_link(metrics: Metrics, parts: Counting) -> None:
     bridge = parts.bridge
     core = bridge.core
     register_links(metrics, lambda: [core.link])
-    parts.connection.datagrams.register(metrics)
+    parts.relays.register(metrics)
+    parts.relays.connection.datagrams.register(metrics)
     register_received(metrics, core.received, bridge.inbound.ages)
     register_codecs(metrics, core.coder)
     parts.link_state.register(metrics)
@@ -174,7 +175,7 @@ def _register_messages(metrics: Metrics, parts: Counting) -> None:
     metrics.counter(
         "sern_bad_frames_total",
         "Frames from the relay that were not valid.",
-        read=lambda: [((), float(parts.connection.bad_frames))],
+        read=lambda: [((), float(parts.relays.connection.bad_frames))],
     )
 
 

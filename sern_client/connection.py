@@ -1,4 +1,5 @@
-"""One relay's transports: the stream, the datagram lane, the connections for class control, and the relay's name."""
+"""The transports to the relay that a client is at: the stream, the datagram lane, the connections for class control,
+and the relay's name. With another relay they are others."""
 
 import asyncio
 import logging
@@ -12,7 +13,7 @@ import zmq
 
 from sern_client.priority_lane import ClientPriorityLane
 from sern_client.relay_name import RelayName, name_in
-from sern_client.transport import RelayTransport
+from sern_client.transport import Dialer, RelayTransport
 from sern_client.udp import ClientLane
 from sern_core.link.link import Link
 from sern_core.site.client import ClientCore
@@ -30,6 +31,7 @@ PATIENCE_S: Final = 2.0
 STALL_PATIENCE_S: Final = 5.0
 """The same while it has more to send and a session: a path that has stalled often comes back."""
 PATIENCE_RTTS: Final = 4.0
+SETTLE_S: Final = 0.1
 LINGER_S: Final = 1.0
 """How long the goodbye, and what is confirmed before it, may take to leave this machine."""
 
@@ -37,7 +39,8 @@ _log = logging.getLogger(__name__)
 
 
 class Connection:
-    """Joins a core to its relay: `open` once, then any calls, then `close`, which is safe at any time.
+    """Joins a core to its relay: `open` once, then any calls, then `close`, which is safe at any time. For another
+    relay `leave_for` it, and `open` again.
 
     `on_down` is told why the stream is down, `on_refused` that the relay does not know our key. What is None is not
     open: not yet, or not wanted, or not possible here.
@@ -63,10 +66,26 @@ class Connection:
         self._on_down = on_down
         self._on_refused = on_refused
         self._linger_s = 0.0
+        self._bad_frames = 0  # from relays that were left
+        self._failed = False  # an attempt has, since it was opened
 
-    def open(self, ctx: "zmq.Context[zmq.Socket[bytes]]", keys: CurvePair | None, server_keys: Sequence[str]) -> None:
-        """Connect, for as long as it takes and again and again. Raises ConfigError when the address is none."""
+    @property
+    def relay(self) -> RelayConnection:
+        """The relay to which it leads."""
+        return self._relay
+
+    def open(
+        self,
+        ctx: "zmq.Context[zmq.Socket[bytes]]",
+        keys: CurvePair | None,
+        server_keys: Sequence[str],
+        *,
+        ready: Dialer | None = None,
+    ) -> None:
+        """Connect, for as long as it takes and again and again. `ready`: a connection to the relay that there is
+        already. Raises ConfigError when the address is none."""
         relay, link, marks = self._relay, self._link, self._link.dscp.marks()
+        self._failed = False
         self.transport = RelayTransport(
             ctx,
             self._core.link,
@@ -76,10 +95,11 @@ class Connection:
             heartbeat_timeout_s=link.heartbeat_timeout_s,
             handshake_interval_s=relay.handshake_interval_s,
             random=Random(secrets.randbits(64)),
-            on_reason=self._on_down,
+            on_reason=self._down,
             on_refused=self._on_refused,
             after=self.wake,
             marks=marks,
+            ready=ready,
         )
         named = name_in(relay.endpoint)
         if named is not None:
@@ -106,9 +126,24 @@ class Connection:
         return self.transport is not None and self.transport.waiting
 
     @property
+    def letting_in(self) -> bool:
+        """Whether the relay has begun to let our first connection in, and has not ended that."""
+        return self.transport is not None and not self._failed and self.transport.letting_in
+
+    @property
+    def up_s(self) -> float | None:
+        """When the relay let a connection in last; None: it has not yet."""
+        return None if self.transport is None else self.transport.up_s
+
+    def _down(self, reason: str) -> None:
+        self._failed = True
+        self._on_down(reason)
+
+    @property
     def bad_frames(self) -> int:
-        """Frames from the relay that were not valid, on whatever lane."""
-        return sum(part.bad_frames for part in (self.transport, self.lane, self.priority_lane) if part is not None)
+        """Frames from relays that were not valid, on whatever lane."""
+        parts = (self.transport, self.lane, self.priority_lane)
+        return self._bad_frames + sum(part.bad_frames for part in parts if part is not None)
 
     def wake(self) -> None:
         """The core may have something to send."""
@@ -175,17 +210,35 @@ class Connection:
         if unconfirmed:
             _log.warning("stopping with %d reliable messages that not everyone has confirmed", unconfirmed)
 
+    async def settle(self) -> None:
+        """Wait for a moment in which nothing of what is reliable is under way, some round trips at most: it may be for
+        a client that has gone. Nothing is lost without such a moment: something is sent twice then, and dropped where
+        it arrives. What is offered meanwhile goes on as ever."""
+        link = self._core.link
+        give_up_s = clock.now() + SETTLE_S + PATIENCE_RTTS * link.lane.flight.rtt.srtt_s
+        while link.established and not link.lane.stalled and clock.now() < give_up_s:
+            channels = link.sender.channels.values()
+            if not any(channel.reliable and any(out.started for out in channel.retained) for channel in channels):
+                return
+            await asyncio.sleep(0.005)
+
     async def leave(self) -> None:
         """Confirm what has arrived, and say goodbye."""
         if self.transport is None:
             return
         self.wake()
         await asyncio.sleep(0.02)  # what has arrived here is confirmed before we say goodbye
+        self.goodbye("client stops")
+
+    def goodbye(self, why: str, *, moved: bool = False) -> None:
+        """Say goodbye now. `moved`: we go on at another relay, which is told what is not confirmed here yet."""
+        if self.transport is None:
+            return
         self.transport.pump.run()
         link = self._core.link
         if link.established and not link.lane.stalled:
             self._linger_s = LINGER_S
-        link.close("client stops", now=clock.now())
+        link.close(why, now=clock.now(), moved=moved)
         self.transport.pump.run()
 
     def close(self) -> None:
@@ -199,6 +252,17 @@ class Connection:
                 stack.callback(self.lane.closed)
             if self.name is not None:
                 stack.callback(self.name.close)
+
+    def leave_for(self, relay: RelayConnection, reason: str) -> None:
+        """End what leads to the relay that there was, with its session unless that was ended, and lead to `relay` when
+        it is opened next."""
+        self.close()
+        self._bad_frames = self.bad_frames
+        self.transport = self.lane = self.priority_lane = self.name = None
+        self._relay, self._linger_s = relay, 0.0
+        now, link = clock.now(), self._core.link
+        link.close(reason, now=now)  # nobody is told any more
+        link.disconnected(now=now, reason=reason)
 
     def _no_datagrams(self, link: Link, within_s: float) -> str | None:
         return None if self.lane is None else self.lane.problem(link, within_s)

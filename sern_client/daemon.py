@@ -17,7 +17,6 @@ from sern_client.actions import GoalWatch
 from sern_client.bridge import Bridge
 from sern_client.checks import TableCheck
 from sern_client.client_metrics import Counting, register_client
-from sern_client.connection import Connection
 from sern_client.endpoints.base import (
     BothTold,
     Endpoint,
@@ -28,12 +27,12 @@ from sern_client.endpoints.base import (
 )
 from sern_client.factory import local_encoding, make_endpoint, make_link_topics
 from sern_client.guard import Guard
-from sern_client.keyring import ClientKeyring, KeyFiles
-from sern_client.link_news import SILENT, LinkNews
+from sern_client.link_news import SILENT
 from sern_client.link_state import LinkState
 from sern_client.making import durable_maker, keep_holders, make_e_stops, rule_of, services_maker, spool_maker
 from sern_client.on_demand import OnDemand
 from sern_client.operating import Operating
+from sern_client.relays import Relays
 from sern_client.scene.making import make_scene
 from sern_client.site import Site
 from sern_client.site_objects import CoreObjects
@@ -45,7 +44,7 @@ from sern_core.objects.feed import PERIOD_S
 from sern_core.site.client import ClientCore, ClientEvents
 from sern_core.topics.patterns import PatternSet, compile_pattern
 from sern_core.vocabulary.errors import ConfigError
-from sern_core.vocabulary.key_news import ClientKeys, RelayKeys
+from sern_core.vocabulary.key_news import RelayKeys
 from sern_core.vocabulary.trace import DecisionTrace
 from sern_core.vocabulary.types import CLASS_LABELS, DropReason, ObjectKind
 from sern_core.wire import framing
@@ -161,6 +160,8 @@ class ClientDaemon:
         self.adaptation = self._make_adaptation()
         self.e_stops = make_e_stops(loaded, self.bridge, self.events)
         keep_holders(loaded, self.bridge)
+        self.relays = Relays(loaded, self.core, self.events, on_down=self.link_down, kick=self._kick)
+        self.news = self.relays.news
         self.operating = Operating(
             loaded,
             self.bridge,
@@ -169,9 +170,8 @@ class ClientDaemon:
             self.notifier,
             e_stops=self.e_stops,
             status=self._status,
-            reload_keys=self._reload_keys,
+            reload_keys=self.relays.reload_keys,
         )
-        self.news = LinkNews(self.core.link, model.relay.endpoint, self.events)
         self.link_state = LinkState(
             self.core,
             make_link_topics(model, self.site.advertise),
@@ -190,6 +190,7 @@ class ClientDaemon:
             self.events,
             reason=self.why,
             address=self._address,
+            relay=self.relays.to_json,
             by_hand=self.operating.to_json,
         )
         if isinstance(endpoint, ShowingEndpoint):
@@ -197,10 +198,7 @@ class ClientDaemon:
             if self.scene is not None:
                 endpoint.show_scene(self.scene)
         self.check = TableCheck(Tables(self.bridge, self.link_state, self.scene), now=now)
-        self.keyring = self._make_keyring()
-        self.connection = Connection(
-            self.core, model.relay, model.link, on_down=self.link_down, on_refused=self._key_refused
-        )
+        self.connection = self.relays.connection
         self.bridge.inbound.subscribed.add("asking", self.bridge.asking.topics)
         self.bridge.inbound.subscribed.begin(model.subscribe_patterns())
         self.core.subscribe_objects(model.object_selections(), now=now)
@@ -226,33 +224,9 @@ class ClientDaemon:
             core.link.end.fates = LoggedFates(self.message_log, self.parts)
         return core
 
-    def _make_keyring(self) -> ClientKeyring | None:
-        relay = self.loaded.model.relay
-        if relay.secret_key_file is None or relay.server_key_file is None:
-            return None
-        files = KeyFiles(self.loaded.resolve(relay.secret_key_file), self.loaded.resolve(relay.server_key_file))
-        return ClientKeyring(files, use=self._use_keys, tell=self._tell_keys, at_s=time.time)
-
-    def _use_keys(self, redial: bool) -> None:
-        if self.keyring is not None:
-            self.connection.use(self.keyring.keys, self.keyring.server_keys, redial=redial)
-
-    def _tell_keys(self, keys: ClientKeys) -> None:
-        if self.core.link.established:
-            self.core.tell_keys(keys, now=clock.now())
-            self._kick()
-
-    def _key_refused(self) -> None:
-        if self.keyring is not None:
-            self.keyring.refused()
-
     def reload(self) -> None:
         """SIGHUP: read the file and the keys anew."""
         self.operating.reload()
-
-    def _reload_keys(self) -> None:
-        if self.keyring is not None:
-            self.keyring.reload()
 
     def _make_goals(self) -> GoalWatch | None:
         sections = self.loaded.model.actions.use
@@ -293,9 +267,7 @@ class ClientDaemon:
         self.collector.watch()
         ros_types.load()
         model = self.loaded.model
-        relay = model.relay
-        if self.keyring is not None:
-            self.keyring.read()
+        self.relays.read()
         if model.http.listen is not None:
             with blamed_on(self.loaded.path, "http", "listen"):
                 self._http = self._make_http(model.http.listen)
@@ -314,11 +286,10 @@ class ClientDaemon:
         if self.guard is not None:
             self.guard.start()
         self._ctx = zmq.Context()
-        with blamed_on(self.loaded.path, "relay", "endpoint"):
-            if self.keyring is None:
-                self.connection.open(self._ctx, None, ())
-            else:
-                self.connection.open(self._ctx, self.keyring.keys, self.keyring.server_keys)
+        relay = self.relays.current
+        with blamed_on(self.loaded.path, *(("relays", 0) if model.relays else ("relay",)), "endpoint"):
+            self.relays.open(self._ctx)
+        self.tasks.append(asyncio.create_task(self.relays.run(), name="client-relays"))
         self.tasks.append(asyncio.create_task(self._tick(), name="client-tick"))
         self.tasks.append(asyncio.create_task(self._tell_objects(), name="client-objects"))
         if self.scene is not None:
@@ -331,9 +302,9 @@ class ClientDaemon:
             kept = self.parts.keep("watching", self.live.run, reset=self.live.reset)
             self.tasks.append(asyncio.create_task(kept, name="watching"))
         await self.operating.start()
-        self.notifier.ready(f"{model.name} -> {relay.endpoint}")
+        self.notifier.ready(f"{model.name} -> {relay.address}")
         words = "client %s started, relay %s"
-        self.events.say(_log, logging.INFO, "started", "", words, model.name, relay.endpoint)
+        self.events.say(_log, logging.INFO, "started", "", words, model.name, relay.address)
 
     def _kick(self) -> None:
         self.connection.wake()
@@ -341,17 +312,17 @@ class ClientDaemon:
     # --- Shell: what becomes of the link ------------------------------------------------------------------------------
 
     def keys_told(self, keys: RelayKeys) -> None:
-        if self.keyring is not None:
-            self.keyring.told(keys)
+        self.relays.keys_told(keys)
 
     def link_down(self, reason: str) -> None:
-        if self.keyring is not None and not self.core.link.established:
-            self.keyring.session_ended()
+        if not self.core.link.established:
+            self.relays.session_ended()
         self.link_state.soon()
         self.news.down(reason)
 
     def link_up(self) -> None:
         self.news.up()
+        self.relays.arrived()
         self.link_state.soon()
         self._put_node()
         self.connection.session_began()
@@ -379,8 +350,7 @@ class ClientDaemon:
                 with self.parts.survive("message_log"):
                     self.message_log.flush()
             self.connection.tick()
-            if self.keyring is not None:
-                self.keyring.look()
+            self.relays.look_at_keys()
             self.check.tick(now=clock.now())
             self.link_state.look()
             self.bridge.outbound.leaving.look(now=clock.now())
@@ -400,7 +370,8 @@ class ClientDaemon:
         """One line for systemd."""
         link = self.core.link
         state = "up" if link.established and not link.lane.stalled else f"down: {self.why()}"
-        return self.operating.reloads.beside(f"link {state}")
+        where = f" at relay {self.relays.current.words}" if self.relays.several and link.established else ""
+        return self.operating.reloads.beside(f"link {state}{where}")
 
     async def _tell_objects(self) -> None:
         while True:
@@ -413,6 +384,9 @@ class ClientDaemon:
         """Why there is no link, as far as it is known."""
         if self.core.link.established:
             return SILENT
+        return f"{self._why_not()}; tried {self.relays.tried}" if self.relays.several else self._why_not()
+
+    def _why_not(self) -> str:
         name = self.connection.name
         unresolved, at = (None, "") if name is None else (name.problem, name.at)
         where = f" ({at})" if at else ""
@@ -423,7 +397,7 @@ class ClientDaemon:
     def _address(self) -> str:
         """Where the relay is: its address in the file, and what that stands for, where it is a name."""
         name = self.connection.name
-        return self.loaded.model.relay.endpoint + (f" ({name.at})" if name is not None and name.at else "")
+        return self.relays.current.address + (f" ({name.at})" if name is not None and name.at else "")
 
     def _put_node(self) -> None:
         """Tell the relay's registry who we are."""
@@ -450,7 +424,7 @@ class ClientDaemon:
         adaptation = self.adaptation
         counting = Counting(
             bridge=self.bridge,
-            connection=self.connection,
+            relays=self.relays,
             link_state=self.link_state,
             check=self.check,
             guard=self.guard,
@@ -468,7 +442,7 @@ class ClientDaemon:
             ready=self.readiness,
             json_routes={
                 **self.views.routes(),
-                "/api/keys": lambda: {} if self.keyring is None else self.keyring.to_json(),
+                "/api/keys": self.relays.keys_json,
                 **({} if self.bridge.spool is None else {"/api/spool": self.bridge.spool.to_json}),
                 **({} if self.scene is None else {"/api/scene": self.scene.to_json}),
                 **({} if adaptation is None else {"/api/mmcf": adaptation.view()}),
@@ -508,6 +482,7 @@ class ClientDaemon:
     async def drain(self) -> None:
         """Stop the sources, send what is owed while that gets anywhere, and say goodbye."""
         self.news.stopping()
+        self.relays.stay()
         self.bridge.outbound.stop_sources()
         await self.connection.drain(lambda: self.bridge.outbound.pending, limit_s=self.loaded.model.link.drain_s)
         if self.bridge.inbound.keeping:
@@ -562,8 +537,7 @@ class ClientDaemon:
             if self.bridge.services is not None:
                 stack.push_async_callback(self.bridge.services.stop)
             stack.callback(self.connection.close)
-            if self.keyring is not None:
-                stack.push_async_callback(self.keyring.close)
+            stack.push_async_callback(self.relays.close)
             stack.callback(self.codecs.close)
             stack.push_async_callback(end_tasks, self.tasks)
             stack.push_async_callback(self.operating.stop)

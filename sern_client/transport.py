@@ -93,6 +93,11 @@ class Dialer:
         """Whether a connection is there, and its handshake under way."""
         return self._watch is not None and self._watch.waiting
 
+    @property
+    def letting_in(self) -> bool:
+        """Whether the handshake of a connection is under way, and something of it has come back."""
+        return self._watch is not None and self._watch.letting_in
+
     def open(self) -> None:
         """Connect for the first time. Raises ConfigError."""
 
@@ -112,10 +117,21 @@ class Dialer:
             tos=self._tos,
             before_connect=attach,
         )
-        self._socket = DealerSocket(
-            raw, self._events.received, on_view=self._events.received, on_writable=self._events.writable
-        )
+        self._socket = DealerSocket(raw, self._events.received)
+        self._have_told(self._socket)
         self._inflow = Inflow(self._socket, self._taken, self._endless)
+
+    def _have_told(self, socket: DealerSocket) -> None:
+        socket.on_message = socket.on_view = self._events.received
+        socket.on_writable = self._events.writable
+
+    def hand_over(self, events: DialerEvents) -> None:
+        """Another one is told from now on, first that there is a connection if there is."""
+        self._events = events
+        if self._socket is not None:
+            self._have_told(self._socket)
+        if self._was_up:
+            events.up(self._handle)
 
     def use(self, keys: CurvePair | None, server_keys: Sequence[str]) -> None:
         """Other keys, for the sockets that are made from now on. One that was made with keys that are over is kept
@@ -222,7 +238,7 @@ class RelayTransport:
     """Joins `link` to `endpoint`; with several `server_keys` (a rotation) they are tried in turn.
 
     `on_reason` is told why the transport is down, `on_refused` that the relay does not know our key; `after` is called
-    when the link has something to send, which may be for another lane.
+    when the link has something to send, which may be for another lane. `ready`: a connection that there is already.
     """
 
     def __init__(
@@ -240,8 +256,11 @@ class RelayTransport:
         on_refused: Callable[[], None] = lambda: None,
         after: Callable[[], None] = lambda: None,
         marks: Marks | None = None,
+        ready: Dialer | None = None,
     ) -> None:
         marks = marks or Marks()
+        self.up_s: float | None = None
+        """When the relay let a connection in last; None: it has not yet."""
         self.after = after
         self.link = link
         self.endpoint = endpoint
@@ -268,9 +287,12 @@ class RelayTransport:
             )
 
         self._dial = dial
-        self.dialer = dial(self)
+        self.dialer = ready or dial(self)
         self.pump = Pump(link, self.dialer.send, on_gone=lambda: None)
-        self.dialer.open()
+        if ready is None:
+            self.dialer.open()
+        else:
+            ready.hand_over(self)
 
     @property
     def rebuilds(self) -> int:
@@ -280,6 +302,11 @@ class RelayTransport:
     def waiting(self) -> bool:
         """Whether a connection is there, and its handshake under way."""
         return self.dialer.waiting
+
+    @property
+    def letting_in(self) -> bool:
+        """Whether that handshake is under way, and something of it has come back."""
+        return self.dialer.letting_in
 
     def another(self, events: DialerEvents) -> Dialer:
         """Another connection to the same relay, for class control, not opened yet."""
@@ -301,8 +328,9 @@ class RelayTransport:
     # --- DialerEvents -------------------------------------------------------------------------------------------------
 
     def up(self, handle: TcpHandle | None) -> None:
+        self.up_s = clock.now()
         self.pump.reset()
-        self.link.connected(now=clock.now())
+        self.link.connected(now=self.up_s)
         self.pump.kick()
 
     def down(self, reason: str) -> None:

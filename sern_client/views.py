@@ -22,8 +22,8 @@ MAX_TOLD: Final = 100
 
 
 class ClientViews:
-    """The routes of one client. `reason` says why there is no link, `address` where the relay is, `by_hand` what is set
-    so."""
+    """The routes of one client. `reason` says why there is no link, `address` where the relay is, `relay` how it is
+    with all of them, `by_hand` what is set so."""
 
     def __init__(
         self,
@@ -35,6 +35,7 @@ class ClientViews:
         *,
         reason: Callable[[], str],
         address: Callable[[], str],
+        relay: Callable[[], dict[str, object]] = dict,
         by_hand: Callable[[], dict[str, Any]] = dict,
     ) -> None:
         self._name = name
@@ -45,6 +46,7 @@ class ClientViews:
         self._events = events
         self._reason = reason
         self._address = address
+        self._relays = relay
         self._by_hand = by_hand
 
     def routes(self) -> dict[str, JsonSource | JsonQuery]:
@@ -67,6 +69,7 @@ class ClientViews:
         return {
             **self._core.link.snapshot(),
             "why": "" if self._up else self._reason(),
+            "relay": self._relays(),
             "summaries": outbound.summaries.to_json(now),
             "refused": dict(list(outbound.refused.items())[:MAX_TOLD]),
             "subscriptions_refused": list(inbound.subscription_problems)[:MAX_TOLD],

@@ -89,6 +89,14 @@ class TransportWatch:
         """Whether a connection is there, and its handshake under way."""
         return self._shaking
 
+    @property
+    def letting_in(self) -> bool:
+        """Whether a handshake is under way, and something of it has come back."""
+        if not self._shaking:
+            return False
+        received = None if self._kept is None else received_bytes(self._kept)
+        return received is None or received > 0
+
     def close(self) -> None:
         """Before the socket. Idempotent."""
         self._monitor.close()

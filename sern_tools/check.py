@@ -66,8 +66,10 @@ def _warnings(loaded: Loaded[FileModel], document: Document) -> Iterator[str]:
     if isinstance(model, keys.PublicKeyFile) and (lapse := keys.load_public(path).lapse(time.time())):
         yield f"{path} {lapse}"
     yield from loaded.warnings
-    if isinstance(model, ClientFile) and (problem := _unresolved(model.relay.endpoint)):
-        yield str(document.error(("relay", "endpoint"), problem))
+    for index, relay in enumerate(model.all_relays if isinstance(model, ClientFile) else ()):
+        if problem := _unresolved(relay.endpoint):
+            loc = ("relay",) if document.root.child("relay") is not None else ("relays", index)
+            yield str(document.error((*loc, "endpoint"), problem))
 
 
 def _unresolved(endpoint: str) -> str | None:
@@ -146,12 +148,14 @@ def _table(*titles: str) -> Table:
 
 
 def _client_summary(out: Console, model: ClientFile) -> None:
-    safety = "no encryption" if model.relay.insecure else "CURVE"
     _lines(
         out,
         [
             f"client {model.name}, namespace {model.namespace}",
-            f"relay {model.relay.endpoint} ({safety})",
+            *(
+                f"relay {relay.endpoint} ({'no encryption' if relay.insecure else 'CURVE'})"
+                for relay in model.all_relays
+            ),
             *(f"endpoint {endpoint.kind}" for endpoint in model.endpoints),
             f"discovery {model.discovery.mode}",
             f"scheduler {model.scheduler.ordering}, window {model.link.window.algorithm}",

@@ -169,7 +169,7 @@ def identity_from_file(path: Path) -> Identity:
     """The name, relay and link of a client file; the rest of the file does not matter. Raises ConfigError."""
     loaded = load_client(path, files=False)
     model = loaded.model
-    relay = model.relay
+    relay = model.all_relays[0]
     return Identity(
         model.name,
         relay.endpoint,

@@ -254,8 +254,13 @@ def put_in_place(secret: Path, pair: SecretKey) -> None:
 
 
 def rotate_client(loaded: Loaded[ClientFile], *, out: Callable[[str], None], limit_s: float = 60.0) -> None:
-    """Make a new pair, have the running client take it to the relay and go over to it, and put it in place."""
-    name = loaded.model.relay.secret_key_file
+    """Make a new pair, have the running client take it to the relay it is at and go over to it, and put it in place."""
+    relays = loaded.model.all_relays
+    name = relays[0].secret_key_file
+    if any(relay.secret_key_file != name for relay in relays):
+        raise ConfigError(
+            "its relays have different secret_key_file; give one key to all of them", file=str(loaded.path)
+        )
     if name is None:
         raise ConfigError("this client has no keys (insecure: true)", file=str(loaded.path))
     secret = loaded.resolve(name)
@@ -278,6 +283,8 @@ def rotate_client(loaded: Loaded[ClientFile], *, out: Callable[[str], None], lim
     put_in_place(secret, pair)
     client.reload()
     out(f"{pair.name} uses {mark} now; the relay lets the old key go when its time is over")
+    if len(relays) > 1:  # they have not met it
+        out(f"on each of its other relays, or it is not let in there: sern keys add {pair.name} -- '{pair.public_key}'")
 
 
 def rotate_relay(loaded: Loaded[RelayFile], *, switch: bool, force: bool, out: Callable[[str], None]) -> None:

@@ -272,6 +272,13 @@ def valid() -> list[Vector]:
             {"name": "jackal1", "boot": 5, "relay": 2**63 - 1},
         ),
         _handshake("close", "the session ends on purpose", "CLOSE", {"why": "shutting down"}, tag=1),
+        _handshake(
+            "hello-last",
+            "of a client that had a session with another relay process",
+            "HELLO",
+            {"name": "jackal1", "boot": 5, "vmin": 1, "vmax": 1, "last": 2**63 - 1},
+        ),
+        _handshake("close-moved", "it goes on elsewhere", "CLOSE", {"why": "moves", "moved": True}, tag=1),
         _data("data-whole", "one message in one fragment", _frame(body=b"hello")),
         _data("data-empty", "a message of no bytes", _frame(body=b"")),
         _data("data-first", "the first fragment of 10 bytes", _frame(body=b"01234", total=10)),
@@ -385,6 +392,11 @@ def valid() -> list[Vector]:
                     {"name": "jackal3"},
                 ],
             },
+        ),
+        _control(
+            "peers-moved",
+            "jackal1 has gone to another relay",
+            {"t": "peers", "peers": [{"name": "jackal1", "up": False, "for": 0.0, "lane": "udp", "moved": True}]},
         ),
         _control(
             "subscribe-known",

@@ -67,6 +67,8 @@ class Handshake:
         process."""
         self.displaced = False
         """The relay has said that another process has our name now, and there was no session since."""
+        self.moved = False
+        """The peer has gone to another relay, which has what it still owes and awaits."""
         self._out: deque[bytes] = deque()
         self._hello_due_s: float | None = None
         self._hello_stamp_us = -1
@@ -132,7 +134,14 @@ class Handshake:
     def _hello(self, now: float) -> bytes:
         self._hello_due_s = now + HELLO_INTERVAL_S
         end = self._end
-        hello = {"name": end.name, "boot": end.boot, "vmin": framing.VERSION_MIN, "vmax": framing.VERSION_MAX}
+        hello: framing.Envelope = {
+            "name": end.name,
+            "boot": end.boot,
+            "vmin": framing.VERSION_MIN,
+            "vmax": framing.VERSION_MAX,
+        }
+        if end.peer_boot is not None:
+            hello["last"] = end.peer_boot
         return framing.encode_handshake(framing.Kind.HELLO, end.tag, microseconds(now), hello)
 
     def _greet(self, due_s: float, now: float) -> None:
@@ -149,11 +158,13 @@ class Handshake:
             self._out.append(framing.encode_handshake(framing.Kind.RESET, tag, microseconds(now), {}))
             self._end.dirty = True
 
-    def close(self, reason: str, now: float) -> None:
-        """End the session on purpose and tell the peer. The transport stays."""
+    def close(self, reason: str, now: float, *, moved: bool = False) -> None:
+        """End the session on purpose and tell the peer. The transport stays. `moved`: we go on at another relay."""
         end = self._end
         if end.established:
-            why = {"why": reason[:200]}
+            why: framing.Envelope = {"why": reason[:200]}
+            if moved:
+                why["moved"] = True
             self._out.append(framing.encode_handshake(framing.Kind.CLOSE, end.tag, microseconds(now), why))
             end.dirty = True
         self._session.end(reason, now)
@@ -211,7 +222,9 @@ class Handshake:
         version = framing.agree_version(framing.take_int(hello, "vmin"), framing.take_int(hello, "vmax"))
         if boot == end.peer_boot and stamp_us < self._hello_stamp_us:
             return False
-        again = end.established and tag == end.tag and boot == end.peer_boot  # our WELCOME was lost
+        # It was at another relay since: what we have said to it, and it to us, may be over for it.
+        elsewhere = framing.take_int(hello, "last", default=end.boot) != end.boot
+        again = end.established and tag == end.tag and boot == end.peer_boot and not elsewhere  # our WELCOME was lost
         if not again and now < self._begun_paid_s - BEGIN_AHEAD_S:
             return False
         self._hello_stamp_us = stamp_us
@@ -219,6 +232,9 @@ class Handshake:
         stream = self._lanes.stream
         if not again:
             self._session.end(NEW_SESSION, now)
+            if elsewhere:
+                end.peer_boot = None
+            self.moved = False
             end.tag = tag
             end.version = version
         elif another_connection:
@@ -274,6 +290,7 @@ class Handshake:
         if kind is framing.Kind.CLOSE:
             if header.tag == end.tag and end.established:
                 why = f"{end.peer} closed the session: {framing.take_str(envelope, 'why')}"
+                self.moved = not end.initiator and framing.take_bool(envelope, "moved", default=False)
                 self._session.end(why, now)
                 if end.initiator:
                     self._greet(now + HELLO_INTERVAL_S, now)

@@ -226,9 +226,9 @@ class Link:
             self.failed(error, now=now)
             return True
 
-    def close(self, reason: str, *, now: float) -> None:
-        """End the session on purpose and tell the peer. The transport stays."""
-        self.handshake.close(reason, now)
+    def close(self, reason: str, *, now: float, moved: bool = False) -> None:
+        """End the session on purpose and tell the peer. The transport stays. `moved`: we go on at another relay."""
+        self.handshake.close(reason, now, moved=moved)
 
     def failed(self, error: Exception, *, now: float) -> None:
         """An error of ours on this link: the owner is told, and the session ends; the next one begins in order."""
@@ -366,6 +366,11 @@ class Link:
     def established(self) -> bool:
         """Whether there is a session."""
         return self.end.established
+
+    @property
+    def moved(self) -> bool:
+        """Whether the peer has ended the session because it goes on at another relay."""
+        return self.handshake.moved
 
     @property
     def dirty(self) -> bool:

@@ -7,7 +7,8 @@ Reliable streams: the origin is told "delivered up to n" when all *required* cli
 stream, have confirmed n. An origin remembers their names; a relay that starts anew learns them from the announcement
 and holds messages for those clients before they have come back (they are *absent*). A client that stays away longer
 than `resume_s` is dropped, and what it has not confirmed is reported to the origins. One that says goodbye and has
-confirmed everything is dropped at once, and so is one whose name is revoked.
+confirmed everything is dropped at once, and so is one whose name is revoked. One that says that it goes on at another
+relay is dropped when nobody is left here who needs what is kept of it.
 """
 
 from collections import Counter, defaultdict
@@ -31,6 +32,7 @@ from sern_core.relay.hub_events import GuardedEvents, HubEvents, Relayed
 from sern_core.relay.hub_matching import Matching
 from sern_core.relay.hub_port import HubPort
 from sern_core.relay.local_streams import LocalStreams
+from sern_core.relay.moved import MovedClients
 from sern_core.relay.object_exchange import OBJECTS_TOPIC, ObjectExchange
 from sern_core.relay.peers import Peers, says_hello
 from sern_core.relay.presence import Presence
@@ -161,6 +163,7 @@ class Hub:
         self.absent = AbsentClients(
             clients, streams, self.routing, self.events, known, link.limits, home=self.peers.home
         )
+        self.moved = MovedClients(clients, self.routing, streams, self.local_owners)
 
     # --- how the parts hang together ------------------------------------------------------------------------------
 
@@ -219,8 +222,8 @@ class Hub:
         """Let go of clients that stay away, and of ended streams that are fully delivered. Call about once a second,
         and then `lapse`."""
         self.lapse(now=now)
-        for client in self.clients.gone(now):
-            if not self.holding.owes(client):
+        for client in (*self.clients.gone(now), *self.moved.not_needed()):
+            if client in self.links and not self.holding.owes(client):
                 self.clients.attempt(client, now, partial(self._forget, client, now))
         self.clients.sweep_orphans(now)
         self.streams.draining.sweep(now=now)
@@ -254,12 +257,15 @@ class Hub:
 
     def left(self, client: ClientName, *, now: float) -> None:
         """A client has said goodbye. One that has streams, or wants reliable ones, may come back to them (a daemon that
-        is started anew), and is waited for like any other; the others are forgotten."""
+        is started anew), and is waited for like any other; the others are forgotten. So is one that goes on at another
+        relay, once nobody here needs what is kept of it."""
         if is_peer(client):
             return
         channels = self.links[client].sender.channels.values()
         if not self.routing.streams_of(client) and not any(channel.reliable for channel in channels):
             self._forget(client, now)
+        elif self.links[client].moved:
+            self.moved.add(client)
 
     def forget(self, client: ClientName, reason: str, *, now: float) -> None:
         """The client's name is revoked: its session ends, and with it whatever is held of it or for it."""
@@ -280,6 +286,7 @@ class Hub:
         self._subscriptions.pop(client, None)
         self.matching.forget(client)
         self.absent.forget(client)
+        self.moved.discard(client)
         self.objects.delete_owned(client)
         self.exchange.forget(client)
         if is_peer(client):
@@ -377,6 +384,7 @@ class Hub:
             self.events.peer_up(link.peer)
             return
         self.peers.came(link.peer, now=now)
+        self.moved.discard(link.peer)
         if link.end.peer_boot is not None:
             self.routing.returned(link.peer, link.end.peer_boot)
         self._subscriptions.pop(link.peer, None)  # half of one that was said in an earlier session
@@ -634,3 +642,4 @@ class Hub:
         self.absent.validate(self.links)
         self.peers.validate()
         self.streams.moves.validate()
+        self.moved.validate()

@@ -56,6 +56,9 @@ class PeerLink(Protocol):
     def established(self) -> bool: ...
 
     @property
+    def moved(self) -> bool: ...
+
+    @property
     def control(self) -> PeerControl: ...
 
 
@@ -67,6 +70,8 @@ class _State(NamedTuple):
     lane: str
     rtt_s: float | None
     rtt_at_s: float
+    moved: bool
+    """It has gone to another relay, and said so."""
 
 
 class _Watcher:
@@ -228,7 +233,8 @@ class Presence:
             lane = view.lane
             if view.srtt_s and _differs(rtt_s, view.srtt_s) and (rtt_s is None or now - rtt_at_s >= RTT_PAUSE_S):
                 rtt_s, rtt_at_s = view.srtt_s, now
-        state = _State(up, since_s, lane, rtt_s, rtt_at_s)
+        moved = link is not None and not link.established and link.moved
+        state = _State(up, since_s, lane, rtt_s, rtt_at_s, moved)
         if state != old:
             self._states[client] = state
             for subscriber in self._subscribers[client]:
@@ -272,6 +278,8 @@ class Presence:
             item["lane"] = state.lane
         if state.rtt_s is not None:
             item["rtt"] = state.rtt_s
+        if state.moved:
+            item["moved"] = True
         return item
 
     def validate(self, taken: Mapping[ClientName, Counter[ClientName]]) -> None:

@@ -89,6 +89,8 @@ class Peers:
 
     def __init__(self) -> None:
         self.on_change: Callable[[PeerChange], None] = lambda _change: None
+        self.moved: set[ClientName] = set()
+        """Those that have gone from our relay to another one, and said so."""
         self._peers: dict[ClientName, _Peer] = {}
         self._streams: Counter[ClientName] = Counter()  # open here, by origin
         self._ended: dict[ClientName, dict[TopicName, None]] = {}  # its topics that ended while it was gone
@@ -107,6 +109,7 @@ class Peers:
     def session_ended(self, *, now: float) -> None:
         """Nobody knows of any peer any more."""
         self._session = False
+        self.moved.clear()
         for peer in self._peers.values():
             peer.up, peer.absent = None, False
         self.reached(False, now=now)
@@ -183,6 +186,7 @@ class Peers:
         name = ClientName(framing.take_str(item, "name", max_length=64))
         if "up" not in item:  # we take nothing of it any more
             here = framing.take_bool(item, "here") if "here" in item else None
+            self.moved.discard(name)
             if name in self._peers:
                 self._let_go(name, self._peers[name], here, now)
             return
@@ -190,6 +194,7 @@ class Peers:
         for_s = framing.take_float(item, "for", low=0.0, high=MAX_FOR_S) or 0.0
         rtt_s = framing.take_float(item, "rtt", low=0.0, high=MAX_RTT_S)
         lane = framing.take_str(item, "lane", max_length=16, default="")
+        moved = framing.take_bool(item, "moved")
         if name not in self._peers and len(self._peers) >= MAX_PEERS and not self._make_way():
             raise WireError(f"the relay tells of more than {MAX_PEERS} peers")
         peer = self._known(name, now)
@@ -199,6 +204,10 @@ class Peers:
         if up:
             self._ended.pop(name, None)
         peer.rtt_s, peer.lane = rtt_s, lane
+        if moved and not up:
+            self.moved.add(name)
+        else:
+            self.moved.discard(name)
         self._settle(name, peer, now)
 
     def _known(self, name: ClientName, now: float) -> _Peer:

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Final, Self
 
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import Discriminator, Field, Tag, ValidationInfo, field_validator, model_validator
 
 from sern_core.site.object_mirror import Selection
 from sern_core.site.services import ServiceRule, subscriptions
@@ -60,7 +60,10 @@ from sern_runtime.config.spool import SpoolSection
 from sern_runtime.config.summaries import one_or_list
 from sern_runtime.config.topics import TopicSection
 from sern_runtime.config.twin import TwinEndpoint
-from sern_runtime.config.yaml import Data
+from sern_runtime.config.yaml import Data, Loc
+
+MAX_RELAYS: Final = 8
+"""Relays that a client goes to: it may take this many times `failover.failover_s` until it has tried them all."""
 
 
 class ClientSection(Section):
@@ -115,6 +118,30 @@ class RelayConnection(Section):
             if getattr(self, key) is None:
                 raise fault("is missing; make keys with sern keygen (insecure: true only on one machine)", key)
         return self
+
+    def placed(self, base_dir: Path) -> Self:
+        """The same with its socket (ipc://) where it is."""
+        return self.model_copy(update={"endpoint": place(base_dir, self.endpoint)})
+
+    def file_problems(self, base_dir: Path, loc: Loc, client: ClientName) -> Iterator[FileProblem]:
+        """Problems with its socket and its key files; `loc` is its place, `client` whose keys it has."""
+        yield from socket_problems(base_dir, self.endpoint, (*loc, "endpoint"))
+        if self.server_key_file is not None:
+            yield from public_key_problems(base_dir, self.server_key_file, (*loc, "server_key_file"), client=client)
+        if self.secret_key_file is not None:
+            yield from secret_key_problems(base_dir, self.secret_key_file, (*loc, "secret_key_file"), owner=client)
+
+
+class FailoverSection(Section):
+    """When a client with several relays goes from one to another."""
+
+    failover_s: Annotated[float, Field(ge=0.5, le=3600)] = 2.0
+    """A relay that has not answered for so long, on whatever lane, is left for the next one in the list; so is one to
+    which no connection comes about within that time. Leave more than three round trips, and more than the outages that
+    the link itself is known for: the other relays cannot be reached in those either."""
+    return_s: Annotated[float, Field(ge=1, le=604_800)] = 300.0
+    """A relay that stands before the one that the client is at is gone back to once it has answered for so long without
+    interruption."""
 
 
 class DiscoverySection(Section):
@@ -248,8 +275,14 @@ class ClientFile(FileModel):
 
     client: ClientSection
     """Who this client is."""
-    relay: RelayConnection
-    """The relay it connects to."""
+    relays: Annotated[tuple[RelayConnection, ...], Field(min_length=1, max_length=MAX_RELAYS)] | None = None
+    """In place of `relay`: several, each as that section, in the order of preference. The client is at one of them;
+    when that does not answer it goes to the next (see `failover`). Whoever is to hear of each other must go to the same
+    one: give all clients the same list."""
+    relay: Annotated[RelayConnection | None, Field(validate_default=True)] = None
+    """The relay it connects to. Either this or `relays`."""
+    failover: FailoverSection = FailoverSection()
+    """When it goes from one of `relays` to another; of no use with one relay."""
     endpoint: Annotated[
         Annotated[EndpointSection, Tag("<one>")]
         | Annotated[tuple[EndpointSection, ...], Field(min_length=1), Tag("<list>")],
@@ -308,6 +341,27 @@ class ClientFile(FileModel):
             return f"is a relay's file, which sern-relay reads; {needed}"
         return None
 
+    @field_validator("relays")
+    @classmethod
+    def _each_has_its_address(cls, relays: tuple[RelayConnection, ...] | None) -> tuple[RelayConnection, ...] | None:
+        seen: dict[str, int] = {}
+        for index, each in enumerate(relays or ()):
+            before = seen.setdefault(each.endpoint, index)
+            if before != index:
+                text = f"is that of relays.{before}, too; each relay has an address of its own"
+                raise fault(text, index, "endpoint")
+        return relays
+
+    @field_validator("relay")
+    @classmethod
+    def _one_or_several(cls, relay: RelayConnection | None, info: ValidationInfo) -> RelayConnection | None:
+        relays = info.data.get("relays", ())  # of a list that is wrong it is said what is
+        if relay is None and relays is None:
+            raise fault("is missing; or write relays, a list of several")
+        if relay is not None and relays is not None:
+            raise fault("has no use with relays; put it into that list, the preferred one first")
+        return relay
+
     @model_validator(mode="after")
     def _rules_fit(self) -> "ClientFile":
         try:
@@ -340,6 +394,13 @@ class ClientFile(FileModel):
     @property
     def name(self) -> ClientName:
         return ClientName(self.client.name)
+
+    @property
+    def all_relays(self) -> tuple[RelayConnection, ...]:
+        """The relays in the order of preference, also when the file names just one."""
+        if self.relays is not None:
+            return self.relays
+        return () if self.relay is None else (self.relay,)
 
     @property
     def namespace(self) -> str:
@@ -388,20 +449,18 @@ class ClientFile(FileModel):
         return selections
 
     def placed(self, base_dir: Path) -> Self:
-        relay = self.relay.model_copy(update={"endpoint": place(base_dir, self.relay.endpoint)})
-        return self.model_copy(update={"relay": relay})
+        if self.relay is not None:
+            return self.model_copy(update={"relay": self.relay.placed(base_dir)})
+        return self.model_copy(update={"relays": tuple(each.placed(base_dir) for each in self.all_relays)})
 
     def file_problems(self, base_dir: Path) -> Iterator[FileProblem]:
-        yield from socket_problems(base_dir, self.relay.endpoint, ("relay", "endpoint"))
+        for index, relay in enumerate(self.all_relays):
+            yield from relay.file_problems(
+                base_dir, ("relay",) if self.relays is None else ("relays", index), self.name
+            )
         yield from self.http.problems(base_dir)
         if self.scene is not None:
             yield from self.scene.file_problems(base_dir, ("scene",))
-        if self.relay.server_key_file is not None:
-            loc = ("relay", "server_key_file")
-            yield from public_key_problems(base_dir, self.relay.server_key_file, loc, client=self.name)
-        if self.relay.secret_key_file is not None:
-            loc = ("relay", "secret_key_file")
-            yield from secret_key_problems(base_dir, self.relay.secret_key_file, loc, owner=self.name)
         several = isinstance(self.endpoint, tuple)
         for index, endpoint in enumerate(self.endpoints):
             yield from endpoint.file_problems(base_dir, ("endpoint", index) if several else ("endpoint",))

@@ -147,6 +147,7 @@ class _Situation:
         self._stays: list[str] = row.get("stays_here", [])
         self._set: Json = row.get("by_hand", {})
         self._spool: Json = row.get("spool", {})
+        self._at: Json = row.get("relay", {})
         self._summaries = {
             item["stream"].rpartition(f"/{item['kind']}")[0] or item["stream"]: item
             for item in row.get("summaries", ())
@@ -289,6 +290,7 @@ class _Situation:
             yield NOTE, f"stays here, as no rule in `topics` names it: {some}"
         yield from _by_hand(self._set)
         yield from _of_spool(self._spool)
+        yield from _at_relay(self._at)
         names = {literal(pattern) for pattern in self._wants}
         for text in self._denied:
             if not any(name in text.replace(":", " ").split() for name in names if name):
@@ -325,6 +327,20 @@ def _of_spool(said: Json) -> Iterator[Word]:
         yield NOTE, f"spool: {messages:,} messages of {topic} are at its robot and not here yet"
     if len(lacking) > SPOOL_SHOWN:
         yield NOTE, f"spool: and of {len(lacking) - SPOOL_SHOWN} more topics; `sern spool ls` lists them"
+
+
+def _at_relay(said: Json) -> Iterator[Word]:
+    """At which of several relays a client is."""
+    if len(said.get("relays", ())) < 2:
+        return
+    moves = f"; it moved {said['moves']} times" if said["moves"] else ""
+    where = f"{said['name']}, {said['address']}" if said["name"] else said["address"]
+    if said["preferred"]:
+        yield NOTE, f"at the preferred relay ({where}){moves}"
+        return
+    first = said["relays"][0]
+    answers = f"has answered for {span(first['answering_s'])}" if first["answering_s"] is not None else first["why"]
+    yield WARN, f"at another relay ({where}) than the preferred one, {first['address']}: {answers}{moves}"
 
 
 def literal(pattern: str) -> str | None:

@@ -58,7 +58,7 @@ async def test_the_chain_is_a_relay_and_two_clients_with_keys(tmp_path: Path) ->
         assert command == [PYTHON, "-P", "-m", f"sern_{program}.cli", "--config", str(tmp_path / f"{name}.yaml")]
     relay = load_relay(tmp_path / "relay.yaml").model
     robot, site = (load_client(tmp_path / f"{name}.yaml").model for name in (ROBOT, SITE))
-    assert [client.relay.endpoint for client in (robot, site)] == list(relay.relay.listen) * 2
+    assert [client.all_relays[0].endpoint for client in (robot, site)] == list(relay.relay.listen) * 2
     assert {path.stem for path in (tmp_path / "clients").iterdir()} == {ROBOT, SITE}
     assert load_public(tmp_path / "relay.pub").name == "relay"
     assert (robot.subscribe, site.subscribe) == ((), ("/bench/.*",))

@@ -187,6 +187,6 @@ def test_the_files_are_configurations_of_clients(tmp_path: Path, data: Path) -> 
         ("/odom", "control", specs["/odom"].lifespan_s),
         ("/points", "bulk", 2.0),
     ]
-    assert robot.relay.udp
+    assert robot.all_relays[0].udp
     site = load_client(site_file(tmp_path, "198.18.1.1")).model
     assert site.adaptation is None and site.subscribe == (f"/{ROBOT}/.*",)

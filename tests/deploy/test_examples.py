@@ -55,7 +55,7 @@ def treated(
 @pytest.mark.parametrize("name", CLIENTS)
 def test_is_accepted(name: str) -> None:
     model = client(name)
-    assert model.relay.endpoint == "tcp://relay.example:5555"
+    assert model.all_relays[0].endpoint == "tcp://relay.example:5555"
     assert model.http.listen is not None and model.http.listen.startswith("127.0.0.1:")
 
 

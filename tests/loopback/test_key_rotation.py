@@ -160,7 +160,8 @@ async def test_a_relay_listens_with_its_new_key_wherever_it_did(tmp_path: Path, 
         write_public(tmp_path / "relay.pub", PublicKeys(ClientName("relay"), both), replace=True)
         robot.reload()
         relay.reload()
-        await until(lambda: robot.keyring is not None and robot.keyring.server_keys == (new.public_key,))
+        keyring = robot.relays.current.keyring
+        await until(lambda: keyring is not None and keyring.server_keys == (new.public_key,))
         await until(lambda: relay.server is not None and relay.server.session_key(ROBOT) is not None, "it is back")
         await lab.end(robot)
         await lab.end(relay)

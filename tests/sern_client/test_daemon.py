@@ -204,7 +204,7 @@ async def test_metrics_are_read_when_they_are_asked_for(tmp_path: Path) -> None:
         Metrics(registry),
         Counting(
             bridge=daemon.bridge,
-            connection=daemon.connection,
+            relays=daemon.relays,
             link_state=daemon.link_state,
             check=daemon.check,
             guard=daemon.guard,

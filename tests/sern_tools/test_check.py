@@ -141,7 +141,8 @@ def test_summary_names_what_matters(deployed: Path) -> None:
         ("relay: {name: hub, listen: []}\n", "f.yaml:1: relay.listen: is too short; at least 1 needed"),
         (
             "client: {}\n",
-            "f.yaml:1: client.name: is missing\nf.yaml:1: relay: is missing\nf.yaml:1: endpoint: is missing",
+            "f.yaml:1: client.name: is missing\nf.yaml:1: relay: is missing; or write relays, a list of several\n"
+            "f.yaml:1: endpoint: is missing",
         ),
         (
             "client: {name: a}\nrelay: {endpoint: 'ipc:///x', insecure: true}\n"

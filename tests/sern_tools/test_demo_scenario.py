@@ -41,9 +41,9 @@ def test_the_files_are_valid(tmp_path: Path) -> None:
     assert load_relay(files[RELAY]).warnings == ()
     robot, site = load_client(files[ROBOT]), load_client(files[SITE])
     assert (robot.warnings, site.warnings) == ((), ())
-    assert robot.model.relay.endpoint == "tcp://127.0.0.2:5001", "where the proxy is"
-    assert site.model.relay.endpoint == "tcp://127.0.0.1:5001"
-    assert robot.model.relay.udp and site.model.relay.udp and robot.model.adaptation is not None
+    assert robot.model.all_relays[0].endpoint == "tcp://127.0.0.2:5001", "where the proxy is"
+    assert site.model.all_relays[0].endpoint == "tcp://127.0.0.1:5001"
+    assert robot.model.all_relays[0].udp and site.model.all_relays[0].udp and robot.model.adaptation is not None
     assert robot.model.subscribe_patterns() == ("/robot(?:/cmd_vel)",)
     assert site.model.subscribe_patterns() == ("/robot/.*",)
 

@@ -17,6 +17,7 @@ class Told:
     """A client's link, as far as `Presence` looks at it."""
 
     established = True
+    moved = False
     acked_seq = 1_000_000
 
     def __init__(self) -> None:

@@ -220,10 +220,13 @@ def test_handshakes_have_the_documented_keys() -> None:
     port.receive(hello, now=0.0)
     link.receive(note(port.next_datagram(now=0.0)), now=0.0)
     note(link.handshake.join(0.0))
-    link.close("done", now=0.0)
+    link.close("done", now=0.0, moved=True)
     note(link.next_datagram(now=0.0))
+    link.connected(now=1.0)
+    note(link.next_datagram(now=1.0))
     assert set(said) == {kind.name for kind in framing.Kind if kind is not framing.Kind.DATA}
     for kind, keys in said.items():
         assert keys == set(table(section(kind))), kind
-        path = DIRECTORY / f"{kind.lower()}.json"
+        with_all = {"HELLO": "hello-last", "CLOSE": "close-moved"}.get(kind, kind.lower())
+        path = DIRECTORY / f"{with_all}.json"
         assert keys == set(json.loads(path.read_text())["envelope"]), kind

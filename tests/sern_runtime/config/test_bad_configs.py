@@ -62,7 +62,7 @@ def test_load_raises_the_first_of_several(tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as caught:
         load_client(path)
     assert (caught.value.file, caught.value.line, caught.value.key) == (str(path), 1, "relay")
-    assert str(caught.value) == f"{path}:1: relay: is missing"
+    assert str(caught.value) == f"{path}:1: relay: is missing; or write relays, a list of several"
 
 
 def test_every_problem_is_reported_in_the_order_of_the_file() -> None:

@@ -353,7 +353,7 @@ def test_sockets_of_this_machine_are_where_the_file_is(
         f"publish_endpoint: '{text}', ingest_endpoint: 'tcp://127.0.0.1:3', publish: ['/a']}}, "
         f"{{name: two, publish_endpoint: 'tcp://127.0.0.1:2', ingest_endpoint: '{text}2', publish: ['/a']}}]}}\n"
     )
-    assert load_client(client).model.relay.endpoint == found
+    assert load_client(client).model.all_relays[0].endpoint == found
     assert load_relay(hub).model.relay.listen == (found,)
     one, two = load_relay(other).model.feed_roles()
     assert (one.publish_endpoint, one.ingest_endpoint) == (found, "tcp://127.0.0.1:3")

@@ -221,3 +221,33 @@ def test_a_configuration_is_in_words() -> None:
     assert in_words(configuration) == "let in: state 50%, bulk 10%; compressed: zstd; control twice; summaries: bulk"
     full = {"rates": {"bulk": 1.0}, "codec": "none", "redundancy": 0, "summaries": None}
     assert in_words(full) == "everything is let in; no compression"
+
+
+@pytest.mark.parametrize(
+    ("said", "note"),
+    [
+        ({"relays": [{}], "moves": 0}, None),
+        ({"relays": [{}, {}], "preferred": True, "moves": 0}, (NOTE, "at the preferred relay (north, tcp://a:1)")),
+        (
+            {"relays": [{}, {}], "preferred": True, "moves": 2},
+            (NOTE, "at the preferred relay (north, tcp://a:1); it moved 2 times"),
+        ),
+        (
+            {"relays": [{"address": "tcp://b:1", "answering_s": None, "why": "it is gone"}, {}], "moves": 1},
+            (
+                WARN,
+                "at another relay (north, tcp://a:1) than the preferred one, tcp://b:1: it is gone; it moved 1 times",
+            ),
+        ),
+        (
+            {"relays": [{"address": "tcp://b:1", "answering_s": 61.0, "why": ""}, {}], "moves": 0},
+            (
+                WARN,
+                "at another relay (north, tcp://a:1) than the preferred one, tcp://b:1: has answered for 61 s",
+            ),
+        ),
+    ],
+)
+def test_at_which_of_several_relays_a_client_is(said: Json, note: tuple[str, str] | None) -> None:
+    relay = {"address": "tcp://a:1", "name": "north", "preferred": False} | said
+    assert seen({}, {}, relay=relay).notes == (() if note is None else (note,))
