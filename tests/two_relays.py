@@ -1,5 +1,7 @@
 """Two relays on one fabric, as processes: keys for the clients, certificates between the relays."""
 
+import json
+from pathlib import Path
 from typing import Any, Final
 
 from sern_core.vocabulary.types import ClientName
@@ -36,3 +38,12 @@ class TwoRelays:
     def at(self, relay: str) -> dict[str, str]:
         """`relay` in the file of a client that is at that one."""
         return {"endpoint": self.endpoints[relay], "server_key_file": f"{relay}.pub"}
+
+    def with_both(self, file: Path, *, first: str) -> Path:
+        """The client's file with a list of both relays, `first` the preferred one, in place of its relay."""
+        content = json.loads(file.read_text())
+        relay = content.pop("relay")
+        order = sorted(RELAYS, key=lambda name: name != first)
+        content["relays"] = [relay | self.at(name) for name in order]
+        content["failover"] = {"failover_s": 1.0, "return_s": 3600.0}
+        return write(self.lab.directory, file.stem, content)

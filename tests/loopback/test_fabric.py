@@ -61,3 +61,28 @@ async def test_a_service_of_a_robot_is_called_from_another_relay(
         assert [await handler(b"%d" % number) for number in range(5)] == [b"re: %d" % number for number in range(5)]
         assert await handler(b"x" * 100_000) == b"re: " + b"x" * 100_000
         assert site.bridge.services is not None
+
+
+@pytest.mark.parametrize("who", ["robot1", "site"])
+async def test_who_goes_over_to_the_other_relay_loses_nothing(tmp_path: Path, who: str) -> None:
+    """The relay of one of the two is killed for good, and that one goes on at the other's."""
+    bag = write_bag(tmp_path / "run.bag", {"/chat": 400})
+    content = bodies(bag)
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        two = TwoRelays(lab)
+        relays = {name: two.relay(name) for name in RELAYS}
+        moves = {"robot1": "relay1", "site": "relay2"}[who]
+        site_file = lab.recorder_file("site", "/.*", relay=two.at("relay2"))
+        robot_file = lab.player_file("robot1", bag, play={"rate": 1}, relay=two.at("relay1"))
+        if who == "site":
+            site_file = two.with_both(site_file, first=moves)
+        else:
+            robot_file = two.with_both(robot_file, first=moves)
+        site = await lab.process(site_file).ready()
+        robot = lab.process(robot_file)
+        await site.until(lambda: delivered(site) >= 100, "has 100 messages")
+        relays.pop(moves).kill()
+        await site.until(lambda: delivered(site) >= 400, "has everything")
+        for process in (robot, site, *relays.values()):
+            await process.stop()
+    assert bodies(tmp_path / "site.bag") == under("robot1", content)
