@@ -73,6 +73,8 @@ def compile_all(root: Path) -> bool:
 
 
 def main(built: Path, twin: Path, listed: Path) -> int:
+    for cache in list(built.rglob("__pycache__")):  # of what ran while it was built: each package makes its own below
+        shutil.rmtree(cache)
     first = {line.removeprefix("./") for line in listed.read_text().splitlines()}
     relocate(built)
     if left := remains(built):
