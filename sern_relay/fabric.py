@@ -77,7 +77,7 @@ class RelayFabric:
         self.peers[peer.name] = peer
         _log.info("relay %s is there", peer.name)
         if peer.rules != self._rules:
-            _log.warning("relay %s has other access rules than this one: clients get what both grant", peer.name)
+            _log.warning("relay %s has other access rules than this one", peer.name)
         end = self._hub.add_peer(peer.name, peer.name)
         hop = FabricHop(self.port, peer.name, end, on_unreadable=partial(self._unreadable, peer.name))
         self._hops[peer.name] = end, hop
