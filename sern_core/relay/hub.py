@@ -324,8 +324,13 @@ class Hub:
             return
         for identity in self.routing.streams_of(client):
             stream, relayed = link.taking.streams.get(identity), self.relayed[identity]
-            if stream is not None and stream.channel_id is not None and relayed.source is not link:
+            if stream is None or stream.channel_id is None or relayed.source is link:
+                continue
+            try:
                 self.streams.take(link, stream, now).source = link
+            except RefusedError as refusal:
+                self.events.refused(peer, refusal.code, str(refusal))
+            else:
                 self.streams.answer(relayed, now)
 
     def revoke(self, access: AccessTable, *, now: float) -> None:
