@@ -143,7 +143,7 @@ performance: setup
 	$(BIN)/python -m benchmarks.mmcf_lab --runs 20 --json build/mmcf_lab.json
 	$(BIN)/python -m benchmarks.sync_lab --json build/sync_lab.json
 	$(BIN)/python -m benchmarks.fabric --json build/fabric.json
-	$(BIN)/python -m benchmarks.document build/fabric.json build/link.json build/sensors.json build/robots.json build/relay.json build/mmcf_lab.json build/sync_lab.json
+	$(BIN)/python -m benchmarks.document build/link.json build/sensors.json build/robots.json build/relay.json build/mmcf_lab.json build/sync_lab.json build/fabric.json
 
 endpoints: setup
 	mkdir -p build

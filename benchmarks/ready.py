@@ -19,7 +19,7 @@ from sern_core.vocabulary.errors import SernError
 from sern_tools.explain_replay import read_bag
 from sern_tools.lab.backends import choose
 
-STEPS: Final = ("link", "sensors", "robots", "relay", "mmcf_lab", "sync_lab")
+STEPS: Final = ("link", "sensors", "robots", "relay", "mmcf_lab", "sync_lab", "fabric")
 MODULES: Final[Mapping[str, str]] = {"psutil": "bench", "zenoh": "bench", "matplotlib": "report"}
 """The extra that each is in."""
 FOLDERS: Final = ("build", "docs/images")
@@ -33,7 +33,7 @@ def lacking(
     try:
         choose(f"{os.getpid()}")
     except SernError as error:
-        yield f"link, sensors, mmcf_lab, sync_lab: {error}"
+        yield f"link, sensors, mmcf_lab, sync_lab, fabric: {error}"
     for module, extra in MODULES.items():
         if importlib.util.find_spec(module) is None:
             yield f"link, sensors, robots, relay: {module} is not installed: pip install '.[{extra}]'"

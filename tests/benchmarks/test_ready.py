@@ -39,7 +39,7 @@ def test_everything_that_is_missing_is_told_at_once(tmp_path: Path, monkeypatch:
     readme.write_text(README.read_text().replace("<!-- link end -->", ""))
     told = "\n".join(ready.lacking(document, tmp_path, tmp_path, readme))
     for words in (
-        "link, sensors, mmcf_lab, sync_lab: the lab needs root",
+        "link, sensors, mmcf_lab, sync_lab, fabric: the lab needs root",
         "no_such_module is not installed: pip install '.[bench]'",
         recordings.DRIVE,
         f"{recordings.SCANS[1]}: is not a PLY file",
