@@ -17,6 +17,7 @@ from sern_runtime.config.keys import load_public
 from sern_sim.models import LinkModel
 from sern_tools.proxy import Route, ShapingProxy
 from tests.daemons import HOST, Json, Lab, Process
+from tests.deploy import test_prometheus_failover as failover
 from tests.deploy import test_prometheus_network as network
 from tests.deploy import test_prometheus_queues as queues
 from tests.deploy.prometheus import Jobs, Prometheus, missing, prometheus, scaled
@@ -48,7 +49,7 @@ FAR_HOST: Final = "127.0.0.2"
 
 
 def test_every_alert_is_fired_by_daemons() -> None:
-    fired = (*ALERTS, *network.ALERTS, *queues.ALERTS)
+    fired = (*ALERTS, *failover.ALERTS, *network.ALERTS, *queues.ALERTS)
     assert sorted(fired) == sorted(rule["alert"] for rule in alerts())
 
 
