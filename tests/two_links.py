@@ -12,7 +12,7 @@ from sern_core.stream.out_message import OutMessage
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
 from sern_core.vocabulary.trace import DecisionTrace
-from sern_core.vocabulary.types import ClientName, DropReason, Encoding, TopicName
+from sern_core.vocabulary.types import ClientName, DropReason, Encoding, PriorityClass, TopicName
 from sern_core.wire import framing
 from sern_core.wire.announce import Announcement
 
@@ -41,7 +41,7 @@ class BareEnd:
             lossless=lossless,
             any_size=any_size,
         )
-        self.port = _HelloPort(self.link)
+        self.port = HelloPort(self.link)
 
     def open(self, topic: str, spec: TopicSpec, *, now: float) -> OutChannel:
         name = TopicName(topic)
@@ -78,18 +78,39 @@ class BareEnd:
     def on_control(self, link: Link, envelope: framing.Envelope, attachment: bytes, *, now: float) -> None: ...
 
 
-class _HelloPort(LanePort):
-    """The end that is spoken to also takes the HELLO, which its owner does elsewhere."""
+class HelloPort:
+    """The only lane of a link as a port. The end that is spoken to also takes the HELLO, which its owner does
+    elsewhere."""
 
     def __init__(self, link: Link) -> None:
-        super().__init__(link, LANE_ZMQ)
+        self._link = link
+        self._lane = LanePort(link, LANE_ZMQ)
 
     def receive(self, data: bytes, *, now: float) -> None:
         if data[2:3] == HELLO_KIND:
             header = framing.decode_header(data)
-            self.link.accept(framing.decode_handshake(data), header.tag, header.stamp_us, now=now)
+            self._link.accept(framing.decode_handshake(data), header.tag, header.stamp_us, now=now)
         else:
-            super().receive(data, now=now)
+            self._lane.receive(data, now=now)
+
+    def next_datagram(self, *, now: float) -> bytes | None:
+        return self._lane.next_datagram(now=now)
+
+    @property
+    def priority(self) -> PriorityClass:
+        return self._lane.priority
+
+    def next_deadline(self) -> float | None:
+        return self._lane.next_deadline()
+
+    def handle_timeout(self, *, now: float) -> None:
+        self._lane.handle_timeout(now=now)
+
+    def connected(self, *, now: float) -> None:
+        self._lane.connected(now=now)
+
+    def disconnected(self, *, now: float) -> None:
+        self._lane.disconnected(now=now)
 
 
 def pair(*, now: float, lossless: bool, any_size: bool) -> tuple[BareEnd, BareEnd]:

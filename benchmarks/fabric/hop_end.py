@@ -11,9 +11,7 @@ from typing import Any, Final
 
 from benchmarks.link.load import Kind, Load, Log, Orders, Spec, offer, ready
 from sern_core.link.definitions import DefinitionStore
-from sern_core.link.lane_port import LanePort
 from sern_core.link.link import Link
-from sern_core.path.lanes import LANE_ZMQ
 from sern_core.stream.in_stream import InStream
 from sern_core.stream.out_channel import OutChannel
 from sern_core.stream.out_message import OutMessage
@@ -29,11 +27,11 @@ from sern_runtime.fabric.hop import ANY_SIZE, LOSSLESS, FabricHop
 from sern_runtime.fabric.port import Claim, PeerRelay
 from sern_runtime.fabric.zenoh_port import ZenohPort
 from sern_runtime.fabric.zenoh_settings import FabricOptions
+from tests.two_links import HelloPort
 
 PORT: Final = 7447
 ROBOT: Final = ClientName("robot")
 SITE: Final = ClientName("site")
-HELLO_KIND: Final = bytes([framing.Kind.HELLO])
 POLL_S: Final = 0.02
 VARIANTS: Final = {
     "fabric": (LOSSLESS, ANY_SIZE),
@@ -80,7 +78,7 @@ class HopEnd:
             any_size=any_size,
         )
         self.port = ZenohPort(options(spec, self.own, self.other), self)
-        self.hop = FabricHop(self.port, self.other, _End(self.link))
+        self.hop = FabricHop(self.port, self.other, HelloPort(self.link))
 
     def open(self, priority: PriorityClass) -> OutChannel:
         """A best-effort stream of a class, as a relay would pass it on."""
@@ -160,20 +158,6 @@ class HopEnd:
     def on_skipped(self, link: Link, stream: InStream, count: int, *, now: float) -> None: ...
     def on_definition(self, link: Link, digest: str, *, now: float) -> None: ...
     def on_control(self, link: Link, envelope: framing.Envelope, attachment: bytes, *, now: float) -> None: ...
-
-
-class _End(LanePort):
-    """The end that is spoken to also takes the HELLO."""
-
-    def __init__(self, link: Link) -> None:
-        super().__init__(link, LANE_ZMQ)
-
-    def receive(self, data: bytes, *, now: float) -> None:
-        if data[2:3] == HELLO_KIND:
-            header = framing.decode_header(data)
-            self.link.accept(framing.decode_handshake(data), header.tag, header.stamp_us, now=now)
-        else:
-            super().receive(data, now=now)
 
 
 def sender(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str, Any]:
