@@ -17,9 +17,10 @@ MAX_KEPT: Final = 4096
 
 
 class GivenUp:
-    """Counters of reliable topics of which something was lost, by client."""
+    """Counters of reliable topics of which something was lost, by client; of `max_kept` topics at most."""
 
-    def __init__(self) -> None:
+    def __init__(self, max_kept: int = MAX_KEPT) -> None:
+        self._max_kept = max_kept
         self._by_client: dict[ClientName, tuple[float, list[SendCounters]]] = {}
         self._count = 0
 
@@ -29,10 +30,10 @@ class GivenUp:
         lost = [each for each in counters if each.reliable_unconfirmed or any(each.by_reason[r] for r in LOSSES)]
         if not lost:
             return
-        del lost[MAX_KEPT:]
+        del lost[self._max_kept :]
         self._by_client[client] = (now, lost)
         self._count += len(lost)
-        while self._count > MAX_KEPT:
+        while self._count > self._max_kept:
             self.back(next(iter(self._by_client)))
 
     def back(self, client: ClientName) -> None:

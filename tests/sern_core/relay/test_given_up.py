@@ -1,8 +1,6 @@
 """Counts of clients that were given up stay for those who look now and then, and have bounds."""
 
-import pytest
 
-from sern_core.relay import given_up
 from sern_core.relay.given_up import KEPT_S, GivenUp
 from sern_core.vocabulary.ledger import SendCounters
 from sern_core.vocabulary.types import ClientName, DropReason, PriorityClass, TopicName
@@ -46,9 +44,8 @@ def test_they_are_forgotten_after_an_hour() -> None:
     assert kept(given) == [("other", "/b")]
 
 
-def test_too_many_topics_cost_the_client_that_was_given_up_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(given_up, "MAX_KEPT", 3)
-    given = GivenUp()
+def test_too_many_topics_cost_the_client_that_was_given_up_first() -> None:
+    given = GivenUp(max_kept=3)
     rows = [counters(f"/{number}", DropReason.SHUTDOWN) for number in range(5)]
     given.keep(SITE, rows[:2], now=0.0)
     given.keep(OTHER, rows[:2], now=1.0)
