@@ -453,6 +453,27 @@ def valid() -> list[Vector]:
             {"t": "key", "relay": [A_KEY, ANOTHER_KEY], "kept": True, "key": A_KEY},
         ),
         _control(
+            "here",
+            "two clients have their latest session at this relay, the second after others elsewhere",
+            {"t": "here", "clients": [["jackal1", 1], ["jackal2", 5]]},
+        ),
+        _control("left", "a client is given up by this relay", {"t": "left", "clients": ["jackal1"]}),
+        _control(
+            "again",
+            "the channel of a stream is about to begin again, from an earlier message on",
+            {"t": "again", "origin": "jackal1", "boot": 7, "topic": "/jackal1/log"},
+        ),
+        _control(
+            "go",
+            "a client that has gone over gets all of a topic that it lacks",
+            {"t": "go", "client": "site1", "topic": "/jackal1/log"},
+        ),
+        _control(
+            "released",
+            "nothing of a topic needs to be kept for the client any more",
+            {"t": "released", "client": "site1", "topic": "/jackal1/log"},
+        ),
+        _control(
             "lane-ask",
             "the client would use a datagram lane",
             {"t": "lane_ask", "ciphers": ["aes-256-gcm", "chacha20-poly1305"]},

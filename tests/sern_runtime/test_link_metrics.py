@@ -46,7 +46,7 @@ class Scene:
 
 
 def alerting() -> str:
-    found = re.search(r'sern_messages_dropped_total\{reason=~"([^"]+)"\}', RULES.read_text())
+    found = re.search(r'sern_messages_dropped_total\{[^}]*reason=~"([^"]+)"\}', RULES.read_text())
     assert found is not None
     return found[1]
 

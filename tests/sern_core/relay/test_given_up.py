@@ -1,6 +1,5 @@
 """Counts of clients that were given up stay for those who look now and then, and have bounds."""
 
-
 from sern_core.relay.given_up import KEPT_S, GivenUp
 from sern_core.vocabulary.ledger import SendCounters
 from sern_core.vocabulary.types import ClientName, DropReason, PriorityClass, TopicName

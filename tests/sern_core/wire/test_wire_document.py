@@ -27,7 +27,7 @@ CORE = [
         "site/client.py", "site/subscription.py", "site/object_mirror.py",
         "link/streams_in.py",
         "link/streams_out.py",
-        "relay/hub.py",
+        "relay/hub.py", "relay/moves.py", "relay/peers.py",
         "relay/hub_port.py",
         "relay/object_exchange.py",
         "relay/relayed_streams.py",
