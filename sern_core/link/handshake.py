@@ -72,6 +72,7 @@ class Handshake:
         self._out: deque[bytes] = deque()
         self._hello_due_s: float | None = None
         self._hello_stamp_us = -1
+        self._hello_last = end.boot  # the relay that the peer was at before, as the HELLO of the session says
         self._reset_due_s = -float("inf")
         self._abort_due_s = -float("inf")
         self._begun_paid_s = -float("inf")  # until then, beginning sessions has used up its share of the time
@@ -223,8 +224,9 @@ class Handshake:
         if boot == end.peer_boot and stamp_us < self._hello_stamp_us:
             return False
         # It was at another relay since: what we have said to it, and it to us, may be over for it.
-        elsewhere = framing.take_int(hello, "last", default=end.boot) != end.boot
-        again = end.established and tag == end.tag and boot == end.peer_boot and not elsewhere  # our WELCOME was lost
+        last = framing.take_int(hello, "last", default=end.boot)
+        greeted = end.established and tag == end.tag and boot == end.peer_boot
+        again = greeted and last == self._hello_last  # our WELCOME was lost
         if not again and now < self._begun_paid_s - BEGIN_AHEAD_S:
             return False
         self._hello_stamp_us = stamp_us
@@ -232,8 +234,9 @@ class Handshake:
         stream = self._lanes.stream
         if not again:
             self._session.end(NEW_SESSION, now)
-            if elsewhere:
+            if last != end.boot:
                 end.peer_boot = None
+            self._hello_last = last
             self.moved = False
             end.tag = tag
             end.version = version

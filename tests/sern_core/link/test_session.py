@@ -4,7 +4,7 @@ import pytest
 
 from sern_core.relay.hub_port import HubPort
 from sern_core.vocabulary.errors import VersionError, WireError
-from sern_core.vocabulary.types import PriorityClass
+from sern_core.vocabulary.types import ClientName, PriorityClass
 from sern_core.wire import framing
 from sern_sim.models import LinkModel, Window
 from tests.world import ClockedPort, SimClient, World, spec
@@ -219,3 +219,19 @@ def test_ports_say_when_they_have_something_to_say() -> None:
     assert not client.core.link.dirty and not port.dirty
     client.core.link.handle_timeout(now=client.now)
     assert client.core.link.dirty
+
+
+def test_a_hello_that_is_said_again_after_another_relay_begins_no_second_session() -> None:
+    """A relay that was started anew is another one to a client, whose HELLO names the one before. Its WELCOME may be
+    late, so the HELLO comes twice. Two sessions with one number would count what is said in each from the beginning, and
+    the client would take what is said in the second for what it had."""
+    world = World(lossless=False)
+    port = HubPort(world.relay.hub, ClientName("site"))
+    words: framing.Envelope = {"name": "site", "boot": 7, "vmin": framing.VERSION_MIN, "vmax": framing.VERSION_MAX}
+    now, answers = world.relay.now, []
+    for number, tag in enumerate((3, 3, 4, 4), 1):
+        hello = framing.encode_handshake(framing.Kind.HELLO, tag, number, words | {"last": 99})
+        now += 5.0
+        port.receive(hello, now=now)
+        answers.append(framing.decode_handshake(port.next_datagram(now=now) or b"")["again"])
+    assert answers == [False, True, False, True]
