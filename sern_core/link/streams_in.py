@@ -237,9 +237,8 @@ class StreamsIn:
 
     def _deliver(self, stream: InStream, message: Message) -> None:
         end = self._end
-        if (
-            end.initiator and self.auto_confirm and stream.perishable
-        ):  # at a relay the next hop sees that the relay's clock stood still
+        # At a relay the next hop sees that the relay's clock stood still.
+        if self.auto_confirm and end.initiator and stream.perishable:
             self._fresh.append((stream, message, self._lanes.clock.steps))
             end.dirty = True
             return

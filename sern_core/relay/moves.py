@@ -47,7 +47,7 @@ class MovingStreams(Protocol):
 
     def apply(self, change: RouteChange, now: float) -> None: ...
 
-    def answered(self, relayed: Relayed, now: float) -> None: ...
+    def told(self, relayed: Relayed, now: float) -> None: ...
 
 
 @dataclass(slots=True)
@@ -160,7 +160,7 @@ class Moves:
         pair = relayed.outs.get(client)
         if pair is not None:
             _submit(held.messages, *pair, now)
-        self._streams.answered(relayed, now)
+        self._streams.told(relayed, now)
 
     # --- the source -------------------------------------------------------------------------------------------------
 

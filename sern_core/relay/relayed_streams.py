@@ -64,7 +64,7 @@ class RelayedStreams:
         routing.route_units = self._replay_units
         self.by_id: dict[StreamId, Relayed] = {}
         self.replays = ReplayStore(cache_bytes)
-        self.fanout = Fanout(self.offer, self._told, self._let_go)
+        self.fanout = Fanout(self.offer, self.told, self._let_go)
         self.draining = Draining(self._end_channel, limits)
         self.tap: Callable[[StreamInfo], bool] = lambda _stream: False
         """Whether the relay itself wants a stream (a subscriber of the feed); set by the shell."""
@@ -152,7 +152,7 @@ class RelayedStreams:
         for identity in sorted(touched):
             relayed = self.by_id.get(identity)
             if relayed is not None:
-                self._told(relayed, now)
+                self.told(relayed, now)
         for denied in change.denied[:MAX_DENIED]:
             text = f"{denied.client} may not subscribe to {denied.topic}: no access rule grants it"
             self._events.refused(denied.client, "forbidden", text)
@@ -337,11 +337,7 @@ class RelayedStreams:
 
     # --- to origins -----------------------------------------------------------------------------------------------
 
-    def answered(self, relayed: Relayed, now: float) -> None:
-        """Who gets the stream has changed."""
-        self._told(relayed, now)
-
-    def _told(self, relayed: Relayed, now: float) -> None:
+    def told(self, relayed: Relayed, now: float) -> None:
         """All subscribers have been told of a stream; to some it may have been impossible."""
         self._answer(relayed, now)
         self.confirm(relayed)

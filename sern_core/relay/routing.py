@@ -225,10 +225,6 @@ class RoutingTable:
         """The peer that announced the stream; None: a client did, or the relay itself."""
         return self._via.get(stream)
 
-    def offers(self, client: ClientName, stream: StreamId) -> bool:
-        """Whether the client would get the stream if it wanted its name."""
-        return self._gets(client, stream) and self._may_have(client, stream.topic)
-
     def interests(self) -> tuple[list[str], list[TopicName]]:
         """The patterns and names that clients want, each once, sorted: what this relay asks its peers for."""
         wanting = [interest for client, interest in self._interests.items() if client not in self.peers]

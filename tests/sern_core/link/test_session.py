@@ -223,8 +223,8 @@ def test_ports_say_when_they_have_something_to_say() -> None:
 
 def test_a_hello_that_is_said_again_after_another_relay_begins_no_second_session() -> None:
     """A relay that was started anew is another one to a client, whose HELLO names the one before. Its WELCOME may be
-    late, so the HELLO comes twice. Two sessions with one number would count what is said in each from the beginning, and
-    the client would take what is said in the second for what it had."""
+    late, so the HELLO comes twice. Two sessions with one number would each count from the beginning, and the client
+    would take what is said in the second for what it had."""
     world = World(lossless=False)
     port = HubPort(world.relay.hub, ClientName("site"))
     words: framing.Envelope = {"name": "site", "boot": 7, "vmin": framing.VERSION_MIN, "vmax": framing.VERSION_MAX}
