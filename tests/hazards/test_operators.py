@@ -22,8 +22,9 @@ async def test_revoked_and_allowed_again(tmp_path: Path) -> None:
         away = key.rename(tmp_path / "robot2.pub")
         relay.signal(signal.SIGHUP)
         await robot2.said("WARNING", "relay refused our key")
-        [row] = [row for row in relay.json("/api/clients")["clients"] if row["name"] == "robot2"]
-        assert row["state"] == "forgotten" and "/robot2/count" not in relay.json("/api/topics")["announced"]
+        # Of a name that is in no directory the row goes as well, when the relay looks next.
+        states = {row["state"] for row in relay.json("/api/clients")["clients"] if row["name"] == "robot2"}
+        assert states <= {"forgotten"} and "/robot2/count" not in relay.json("/api/topics")["announced"]
         shutil.copy(away, key)
         relay.signal(signal.SIGHUP)
         await relay.until(lambda: "/robot2/count" in relay.json("/api/topics")["announced"], "has it again")
