@@ -40,6 +40,9 @@ class Field:
         self.robot = robot
         self.recordings: list[Path] = [lab.directory / "site.bag"]
         """The site's recordings, in their order."""
+        self.again = 0
+        """So many messages at the end of a recording may begin the next one, too: what a killed site had not confirmed
+        it gets again."""
         self.sessions: dict[str, int] = {"robot1": 1, "site": 1}
         """How often each client has come to the relay by the end."""
 
@@ -74,7 +77,11 @@ class Field:
             left = path.with_name(f"{path.name}.active")  # of a process that was killed
             if left.exists():
                 finish(left)
-        arrived = [body for path in self.recordings for body in bodies(path).get("/robot1/count", [])]
+        arrived: list[bytes] = []
+        for path in self.recordings:
+            found = bodies(path).get("/robot1/count", [])
+            twice = max(n for n in range(self.again + 1) if n == 0 or found[:n] == arrived[-n:])
+            arrived += found[twice:]
         assert arrived == [played[index % COUNT] for index in range(len(arrived))]
         assert len(arrived) > 100
 

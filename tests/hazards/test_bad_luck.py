@@ -20,6 +20,8 @@ from tests.hazards.kills import play
 
 DURABLE: Final[list[dict[str, Any]]] = [{"match": "/chat", "class": "state", "durable": True}]
 HOUR_S: Final = 3600
+UNCONFIRMED: Final = 10
+"""Messages that may be under way to a site, or recorded and not confirmed, when it is killed."""
 
 
 # --- processes ------------------------------------------------------------------------------------------------------
@@ -34,11 +36,12 @@ async def test_kill_9_of_the_relay(tmp_path: Path) -> None:
 
 
 async def test_kill_9_of_the_site(tmp_path: Path) -> None:
-    """Its next process goes on where the recording of the last one ends."""
+    """Its next process goes on where the last recording ends, or with what had not been confirmed of it."""
     async with field(tmp_path) as world:
         world.site.kill()
         world.site = await world.lab.process(world.lab.recorder_file("site", "/robot1/.*", path="second")).ready()
         world.recordings.append(tmp_path / "second.bag")
+        world.again = UNCONFIRMED
         world.sessions["site"] = 2
         await world.goes_on()
 
