@@ -19,7 +19,7 @@ from sern_core.vocabulary.types import ClientName
 from sern_runtime import clock
 from sern_runtime.config.fabric import FabricSection
 from sern_runtime.fabric.hop import FabricHop
-from sern_runtime.fabric.port import Claim, FabricPort, PeerRelay
+from sern_runtime.fabric.port import FabricPort, PeerRelay
 from sern_runtime.fabric.zenoh_port import ZenohPort, options_of
 
 RULES_DIGITS: Final = 32
@@ -90,12 +90,6 @@ class RelayFabric:
             del self.peers[name]
             self._cut(name)
             _log.warning("relay %s is gone, or out of reach", name)
-
-    def claimed(self, claim: Claim) -> None:
-        """Relays tell each other over their hop who is where (`sern_core.relay.peers`): in order with the streams."""
-
-    def released(self, claim: Claim) -> None:
-        """As `claimed`."""
 
     def arrived(self, source: ClientName, datagram: bytes) -> None:
         pair = self._hops.get(source)

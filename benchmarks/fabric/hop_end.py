@@ -24,7 +24,7 @@ from sern_core.wire.announce import Announcement
 from sern_runtime import clock
 from sern_runtime.config.fabric import CA_FILE, CertificateFiles, certificate_file, key_file
 from sern_runtime.fabric.hop import ANY_SIZE, LOSSLESS, FabricHop
-from sern_runtime.fabric.port import Claim, PeerRelay
+from sern_runtime.fabric.port import PeerRelay
 from sern_runtime.fabric.zenoh_port import ZenohPort
 from sern_runtime.fabric.zenoh_settings import FabricOptions
 from tests.two_links import HelloPort
@@ -117,12 +117,6 @@ class HopEnd:
     def peer_down(self, name: ClientName, boot: int) -> None:
         del name, boot
         self.link.disconnected(now=clock.now())
-
-    def claimed(self, claim: Claim) -> None:
-        """Nobody claims anything here."""
-
-    def released(self, claim: Claim) -> None:
-        """Nor releases."""
 
     def arrived(self, source: ClientName, datagram: bytes) -> None:
         del source

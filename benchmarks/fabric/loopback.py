@@ -17,7 +17,7 @@ from benchmarks.common import Report, interleaved, medians, percentile
 from benchmarks.fabric.hop_end import ROBOT, SITE, certificates
 from sern_core.vocabulary.types import ClientName, PriorityClass
 from sern_runtime.config.fabric import CA_FILE, CertificateFiles, certificate_file, key_file
-from sern_runtime.fabric.port import Claim, PeerRelay
+from sern_runtime.fabric.port import PeerRelay
 from sern_runtime.fabric.zenoh_port import ZenohPort
 from sern_runtime.fabric.zenoh_settings import FabricOptions
 from sern_tools.ports import free_ports
@@ -41,8 +41,6 @@ class _Told:
         self.up.set()
 
     def peer_down(self, name: ClientName, boot: int) -> None: ...
-    def claimed(self, claim: Claim) -> None: ...
-    def released(self, claim: Claim) -> None: ...
 
     def arrived(self, source: ClientName, datagram: bytes) -> None:
         del source

@@ -2,9 +2,8 @@
 
     sern/R/h/DST/SRC/CLASS                        a datagram of relay SRC for relay DST; CLASS as the wire numbers it
     sern/R/relay/RELAY/BOOT/LOW/HIGH/RULES        token: the relay is there, and speaks wire versions LOW to HIGH
-    sern/R/at/CLIENT/RELAY/BOOT/EPOCH             token: the client is at that relay
 
-R is the release of these keys and of what is in them. Names of relays and clients are lower-case letters, digits and
+R is the release of these keys and of what is in them. Names of relays are lower-case letters, digits and
 `_` (`sern_core.vocabulary.names`): none of the signs that mean something in a key expression (`/ * $ # ?`), so they
 stand in a key as they are. They are checked in both directions, since what comes may be anybody's.
 """
@@ -15,7 +14,7 @@ from typing import Final
 from sern_core.vocabulary.names import client_name, is_client_name
 from sern_core.vocabulary.types import CLASSES, ClientName, PriorityClass
 from sern_core.wire.framing import HANDSHAKE_VERSION
-from sern_runtime.fabric.port import Claim, PeerRelay
+from sern_runtime.fabric.port import PeerRelay
 
 ROOT: Final = f"sern/{HANDSHAKE_VERSION}"
 """R is the version of the handshake, which never changes: two relays of other wire versions meet under it, and agree
@@ -27,7 +26,6 @@ _RULES: Final = re.compile(r"[0-9a-f]{1,128}")
 _ALL: Final = f"{ROOT}/"
 _HOPS: Final = f"{ROOT}/h/"
 RELAY_TOKENS: Final = f"{ROOT}/relay/**"
-CLIENT_TOKENS: Final = f"{ROOT}/at/**"
 
 
 def hop_key(destination: ClientName, source: ClientName, priority: PriorityClass) -> str:
@@ -46,10 +44,6 @@ def relay_token(relay: PeerRelay) -> str:
     return f"{ROOT}/relay/{client_name(relay.name)}/{relay.boot}/{low}/{high}/{rules}"
 
 
-def client_token(claim: Claim) -> str:
-    return f"{ROOT}/at/{client_name(claim.client)}/{client_name(claim.relay)}/{claim.boot}/{claim.epoch}"
-
-
 def parse_source(key: str, own: ClientName) -> ClientName | None:
     """Who wrote a datagram for us; None: it is not such a key."""
     parts = key.removeprefix(_HOPS).split("/") if key.startswith(_HOPS) else ()
@@ -58,7 +52,7 @@ def parse_source(key: str, own: ClientName) -> ClientName | None:
     return ClientName(parts[1])
 
 
-def parse_token(key: str) -> PeerRelay | Claim | None:
+def parse_token(key: str) -> PeerRelay | None:
     """None: it is no token of ours."""
     if not key.startswith(_ALL):
         return None
@@ -69,10 +63,6 @@ def parse_token(key: str) -> PeerRelay | Claim | None:
         numbers = [_number(text) for text in (boot, low, high)]
         if is_client_name(name) and None not in numbers and (rules == NO_RULES or _RULES.fullmatch(rules)):
             return PeerRelay(ClientName(name), int(boot), (int(low), int(high)), "" if rules == NO_RULES else rules)
-    elif kind == "at" and len(parts) == 4:
-        client, relay, boot, epoch = parts
-        if is_client_name(client) and is_client_name(relay) and None not in (_number(boot), _number(epoch)):
-            return Claim(ClientName(client), ClientName(relay), int(boot), int(epoch))
     return None
 
 

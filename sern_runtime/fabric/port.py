@@ -1,13 +1,13 @@
-"""What relays have of each other: datagrams between two of them, who is there, and where clients are.
+"""What relays have of each other: datagrams between two of them, and who is there.
 
 The interface between the core's peer relays and whatever carries their datagrams. It names no library: one
 implementation is `zenoh_port`, and another may carry the same in virtual time. All of it is called on the thread of the
 event loop, and nothing in it waits.
 
-A port promises three things: what `arrived` names as the source is who sent it (by the source's certificate, where
-there are any, and not by what the datagram says); a claim that is told was made by the relay that it names; and every
-`peer_up` is followed by one `peer_down` of the same boot, every `claimed` by one `released`, at the latest in `close`.
-It does not promise that a datagram arrives, or arrives in order: that is the business of the two `Link`s.
+A port promises two things: what `arrived` names as the source is who sent it (by the source's certificate, where there
+are any, and not by what the datagram says); and every `peer_up` is followed by one `peer_down` of the same boot, at the
+latest in `close`. It does not promise that a datagram arrives, or arrives in order: that is the business of the two
+`Link`s.
 """
 
 from collections import Counter
@@ -32,17 +32,6 @@ class PeerRelay(NamedTuple):
     """The hash of its access rules, in hexadecimal digits; empty: it does not say."""
 
 
-class Claim(NamedTuple):
-    """A relay says that a client is there."""
-
-    client: ClientName
-    relay: ClientName
-    boot: int
-    """Of the relay."""
-    epoch: int
-    """Of two claims of one client the higher one holds: the other is of an old session."""
-
-
 class FabricEvents(Protocol):
     """What a port tells its owner, in turns of the loop of their own: never inside a call of the port, but `close`."""
 
@@ -50,13 +39,7 @@ class FabricEvents(Protocol):
         """A relay is there. After a restart the new process may be told before the old one is gone (`peer_down`)."""
 
     def peer_down(self, name: ClientName, boot: int) -> None:
-        """That process is gone, or out of reach. Its claims are released each for itself, before or after."""
-
-    def claimed(self, claim: Claim) -> None:
-        """Another relay has the client. Never of our own claims."""
-
-    def released(self, claim: Claim) -> None:
-        """What was claimed is not claimed any more: the client left, or its relay is out of reach."""
+        """That process is gone, or out of reach."""
 
     def arrived(self, source: ClientName, datagram: bytes) -> None:
         """A datagram of the relay of that name, whatever it says inside. It may come before `peer_up`."""
@@ -77,12 +60,6 @@ class FabricPort(Protocol):
         """Hand a datagram over. Never waits for room. False: dropped, and counted. True is no delivery receipt: it may
         still be dropped where a queue is full, and nobody is told."""
 
-    def claim(self, client: ClientName, epoch: int) -> None:
-        """Tell everyone that the client is here, in place of an earlier claim for it. Holds until `release`."""
-
-    def release(self, client: ClientName) -> None:
-        """The client is here no more. Idempotent."""
-
     async def close(self) -> None:
         """Leave: the others see it at once. Idempotent, and allowed after a `start` that failed."""
 
@@ -95,7 +72,7 @@ class FabricDrop(StrEnum):
     TOO_LARGE = "too_large"  # more than `max_datagram_bytes`
     REFUSED = "refused"  # the carrier raised
     INBOX_FULL = "inbox_full"  # it arrived faster than the loop takes it
-    NEWS_FULL = "news_full"  # more relays and claims than are remembered
+    NEWS_FULL = "news_full"  # more relays than are remembered
     BAD_KEY = "bad_key"  # a key or token that no relay of ours writes
     OWN_NAME = "own_name"  # of a relay that has our name
 
@@ -115,8 +92,6 @@ class FabricCounters:
     """All of them together."""
     peers_up: int = 0
     """Relays that are there now."""
-    claims: int = 0
-    """Clients of other relays that are known now."""
 
     def snapshot(self) -> Mapping[str, float]:
         """All counters as numbers; drops as `dropped_REASON`, each reason once."""
@@ -128,6 +103,5 @@ class FabricCounters:
             "send_block_max_s": self.send_block_max_s,
             "send_block_s": self.send_block_s,
             "peers_up": self.peers_up,
-            "claims": self.claims,
             **{f"dropped_{reason.value}": self.dropped[reason] for reason in FabricDrop},
         }

@@ -1,10 +1,10 @@
-"""The fabric over zenoh: one session, an inbox, tokens for who is there and where clients are.
+"""The fabric over zenoh: one session, an inbox, tokens for who is there.
 
 zenoh calls from threads of its own. What it says there is put down and the loop is woken, no more: a callback of 20 ms
 would hold up all that the session receives (measured). They are called straight from zenoh's receiving thread: another
 thread and a queue of zenoh's in between gained no time (measured), and that queue would not be ours to bound.
 
-Tokens are declared by a thread of ours, in order: zenoh lets a declaration wait for room.
+The session is opened and closed in a thread of ours: zenoh waits there.
 """
 
 import asyncio
@@ -24,7 +24,7 @@ from sern_core.wire.framing import MAX_DATAGRAM_BYTES
 from sern_runtime.config.endpoints import installing
 from sern_runtime.config.fabric import FabricSection
 from sern_runtime.fabric import keys
-from sern_runtime.fabric.port import Claim, FabricCounters, FabricDrop, FabricEvents, PeerRelay
+from sern_runtime.fabric.port import FabricCounters, FabricDrop, FabricEvents, PeerRelay
 from sern_runtime.fabric.zenoh_settings import RETRY_MAX_S, FabricOptions, settings
 
 BATCH: Final = 200
@@ -98,12 +98,8 @@ class ZenohPort:
         self._sources: dict[str, ClientName] = {}
         self._peers: dict[tuple[ClientName, int], PeerRelay] = {}
         self._boots: dict[ClientName, int] = {}  # how many processes of that name are there
-        self._claims: set[Claim] = set()
         self._told_own_name = False
-        # What we say. `_wanted` is written by the loop, `_held` by the thread alone.
-        self._wanted: dict[ClientName, int] = {}
-        self._held: dict[ClientName, tuple[int, Any]] = {}
-        self._declaring = ThreadPoolExecutor(1, thread_name_prefix="fabric-tokens")
+        self._opening = ThreadPoolExecutor(1, thread_name_prefix="fabric")
 
     # --- life -------------------------------------------------------------------------------------------------------
 
@@ -113,9 +109,9 @@ class ZenohPort:
         try:
             config = self._config()
             if self._options.external:
-                self._declaring.submit(self._open_when_there_is_a_router, config)
+                self._opening.submit(self._open_when_there_is_a_router, config)
             else:
-                await self._open_now(self._loop.run_in_executor(self._declaring, self._open, config))
+                await self._open_now(self._loop.run_in_executor(self._opening, self._open, config))
         except self._zenoh.ZError as error:
             await self.close()
             raise ConfigError(f"zenoh does not start: {_one_line(error)}") from error
@@ -157,9 +153,8 @@ class ZenohPort:
         inbox = straight(self._on_datagram, indirect=False)
         self._keeps.append(session.declare_subscriber(keys.inbox(options.name), inbox))
         liveliness = session.liveliness()
-        for tokens in (keys.RELAY_TOKENS, keys.CLIENT_TOKENS):
-            news = straight(self._on_token, indirect=False)
-            self._keeps.append(liveliness.declare_subscriber(tokens, news, history=True))
+        news = straight(self._on_token, indirect=False)
+        self._keeps.append(liveliness.declare_subscriber(keys.RELAY_TOKENS, news, history=True))
         self._keeps.append(liveliness.declare_token(keys.relay_token(options.itself)))
 
     async def close(self) -> None:
@@ -169,18 +164,15 @@ class ZenohPort:
         self._closed = True
         self._leaving.set()
         if self._loop is not None:
-            await self._loop.run_in_executor(self._declaring, self._leave)
-        self._declaring.shutdown()
+            await self._loop.run_in_executor(self._opening, self._leave)
+        self._opening.shutdown()
         self._inbox.clear()
         self._news.clear()
-        for claim in sorted(self._claims):
-            self._forget_claim(claim)
         for peer in list(self._peers.values()):
             self._forget_peer(peer)
 
     def _leave(self) -> None:
         self._keeps.clear()
-        self._held.clear()
         session, self._session = self._session, None
         if session is not None:
             session.close()
@@ -224,36 +216,6 @@ class ZenohPort:
     def _drop(self, reason: FabricDrop) -> bool:
         self.counters.dropped[reason] += 1
         return False
-
-    def claim(self, client: ClientName, epoch: int) -> None:
-        if self._wanted.get(client) != epoch:
-            self._wanted[client] = epoch
-            self._declare(client)
-
-    def release(self, client: ClientName) -> None:
-        if self._wanted.pop(client, None) is not None:
-            self._declare(client)
-
-    def _declare(self, client: ClientName) -> None:
-        if not self._closed:
-            self._declaring.submit(self._make_it_so, client)
-
-    def _make_it_so(self, client: ClientName) -> None:
-        """In the thread: what is declared becomes what is wanted. The new claim comes before the old one goes."""
-        wanted, session = self._wanted.get(client), self._session
-        epoch, token = self._held.get(client, (None, None))
-        if session is None or wanted == epoch:
-            return
-        try:
-            if wanted is None:
-                del self._held[client]
-            else:
-                claim = Claim(client, self._options.name, self._options.boot, wanted)
-                self._held[client] = (wanted, session.liveliness().declare_token(keys.client_token(claim)))
-            if token is not None:
-                token.undeclare()
-        except self._zenoh.ZError as error:
-            _log.warning("the fabric is not told where %s is: %s", client, error)
 
     # --- in, on zenoh's threads -------------------------------------------------------------------------------------
 
@@ -346,45 +308,24 @@ class ZenohPort:
         self.counters.dropped[FabricDrop.NEWS_FULL] = self._news_full
 
     def _told(self, key: str, alive: bool) -> None:
-        token = keys.parse_token(key)
-        if token is None:
+        peer = keys.parse_token(key)
+        if peer is None:
             self._drop(FabricDrop.BAD_KEY)
-            return
-        relay = token.name if isinstance(token, PeerRelay) else token.relay
-        if relay == self._options.name:
-            self._own(token, alive)
-        elif not self._known(relay):
+        elif peer.name == self._options.name:
+            self._own(peer, alive)
+        elif not self._known(peer.name):
             self._drop(FabricDrop.BAD_KEY)
-        elif isinstance(token, Claim):
-            self._told_claim(token, alive)
         else:
-            self._told_peer(token, alive)
+            self._told_peer(peer, alive)
 
-    def _own(self, token: PeerRelay | Claim, alive: bool) -> None:
+    def _own(self, peer: PeerRelay, alive: bool) -> None:
         """Our own token comes back to us, too; or somebody else has our name."""
-        if token.boot == self._options.boot or not alive:
+        if peer.boot == self._options.boot or not alive:
             return
         self._drop(FabricDrop.OWN_NAME)
         if not self._told_own_name:
             self._told_own_name = True
             _log.error(OWN_NAME_TEXT, self._options.name)
-
-    def _told_claim(self, claim: Claim, alive: bool) -> None:
-        if not alive:
-            self._forget_claim(claim)
-        elif claim not in self._claims:
-            if len(self._claims) >= self._options.tokens:
-                self._drop_news()
-                return
-            self._claims.add(claim)
-            self.counters.claims = len(self._claims)
-            self._events.claimed(claim)
-
-    def _forget_claim(self, claim: Claim) -> None:
-        if claim in self._claims:
-            self._claims.remove(claim)
-            self.counters.claims = len(self._claims)
-            self._events.released(claim)
 
     def _told_peer(self, peer: PeerRelay, alive: bool) -> None:
         known = self._peers.get((peer.name, peer.boot))

@@ -17,7 +17,7 @@ from typing import Any, Final
 from sern_core.vocabulary.types import ClientName
 from sern_core.wire.framing import MAX_DATAGRAM_BYTES, VERSIONS, Versions
 from sern_runtime.config.fabric import LEASE_S, CertificateFiles
-from sern_runtime.fabric.keys import CLIENT_TOKENS, RELAY_TOKENS, ROOT, inbox
+from sern_runtime.fabric.keys import RELAY_TOKENS, ROOT, inbox
 from sern_runtime.fabric.port import PeerRelay
 
 RETRY_FIRST_S: Final = 0.25
@@ -59,7 +59,7 @@ class FabricOptions:
     """Datagrams that may wait for the event loop; it takes them within a turn or two."""
     inbox_bytes: int = 64 * 2**20
     tokens: int = 100_000
-    """Relays and claims that are remembered."""
+    """Relays that are remembered."""
 
     @property
     def itself(self) -> PeerRelay:
@@ -125,18 +125,16 @@ def _everywhere(locator: str) -> str:
 
 def access_control(own: ClientName, others: Sequence[ClientName]) -> dict[str, Any]:
     """Who may write what to this relay, by the common name of the certificate; nobody else anything."""
-    news = [RELAY_TOKENS, CLIENT_TOKENS]
     outward = ["put", "declare_subscriber", "declare_liveliness_subscriber", "liveliness_query", "liveliness_token"]
     rules = [_rule("out", "egress", outward, [f"{ROOT}/**"])]
     subjects: list[dict[str, Any]] = [{"id": "all"}]
     policies = [{"rules": ["out"], "subjects": ["all"]}]
     for other in others:
-        tokens = [f"{ROOT}/relay/{other}/**", f"{ROOT}/at/*/{other}/**"]
         theirs = [
             _rule(f"put {other}", "ingress", ["put"], [f"{ROOT}/h/{own}/{other}/*"]),
             _rule(f"inbox {other}", "ingress", ["declare_subscriber"], [inbox(other)]),
-            _rule(f"look {other}", "ingress", ["declare_liveliness_subscriber", "liveliness_query"], news),
-            _rule(f"tokens {other}", "ingress", ["liveliness_token"], tokens),
+            _rule(f"look {other}", "ingress", ["declare_liveliness_subscriber", "liveliness_query"], [RELAY_TOKENS]),
+            _rule(f"tokens {other}", "ingress", ["liveliness_token"], [f"{ROOT}/relay/{other}/**"]),
         ]
         rules += theirs
         subjects.append({"id": other, "cert_common_names": [other]})

@@ -9,7 +9,7 @@ from typing import Any
 
 from sern_core.vocabulary.types import ClientName
 from sern_runtime.config.fabric import CA_FILE, CertificateFiles, certificate_file, key_file
-from sern_runtime.fabric.port import Claim, PeerRelay
+from sern_runtime.fabric.port import PeerRelay
 from sern_runtime.fabric.zenoh_port import ZenohPort
 from sern_runtime.fabric.zenoh_settings import FabricOptions
 from sern_tools.ports import free_ports
@@ -24,7 +24,6 @@ class Told:
 
     def __init__(self) -> None:
         self.peers: dict[ClientName, PeerRelay] = {}
-        self.claims: set[Claim] = set()
         self.news: list[tuple[str, object]] = []
         self.datagrams: list[tuple[ClientName, bytes]] = []
         self.on_datagram: Callable[[ClientName, bytes], None] = lambda _source, _datagram: None
@@ -41,15 +40,6 @@ class Told:
         if self.peers[name].boot == boot:
             del self.peers[name]
         self._note("down", (name, boot))
-
-    def claimed(self, claim: Claim) -> None:
-        assert claim not in self.claims
-        self.claims.add(claim)
-        self._note("claimed", claim)
-
-    def released(self, claim: Claim) -> None:
-        self.claims.remove(claim)
-        self._note("released", claim)
 
     def arrived(self, source: ClientName, datagram: bytes) -> None:
         self.datagrams.append((source, datagram))

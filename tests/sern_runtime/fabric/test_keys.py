@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from sern_core.vocabulary.errors import UsageError
 from sern_core.vocabulary.types import CLASSES, ClientName, PriorityClass
 from sern_runtime.fabric import keys
-from sern_runtime.fabric.port import Claim, PeerRelay
+from sern_runtime.fabric.port import PeerRelay
 
 NAMES = st.from_regex(r"[a-z][a-z0-9_]{0,62}", fullmatch=True).map(ClientName)
 BOOTS = st.integers(0, 2**63 - 1)
@@ -19,12 +19,6 @@ BOOTS = st.integers(0, 2**63 - 1)
 def test_a_relay_there_and_back(name: ClientName, boot: int, low: int, high: int, rules: str) -> None:
     relay = PeerRelay(name, boot, (low, high), rules[:128])
     assert keys.parse_token(keys.relay_token(relay)) == relay
-
-
-@given(NAMES, NAMES, BOOTS, BOOTS)
-def test_a_claim_there_and_back(client: ClientName, relay: ClientName, boot: int, epoch: int) -> None:
-    claim = Claim(client, relay, boot, epoch)
-    assert keys.parse_token(keys.client_token(claim)) == claim
 
 
 @given(NAMES, NAMES, st.sampled_from(CLASSES))
@@ -38,10 +32,7 @@ def test_what_is_no_key_of_ours_is_nobody(text: str) -> None:
     for key in (text, f"{keys.ROOT}/{text}", f"{keys.ROOT}/h/me/{text}", f"{keys.ROOT}/relay/{text}"):
         source, token = keys.parse_source(key, own), keys.parse_token(key)
         assert source is None or key in {keys.hop_key(own, source, priority) for priority in CLASSES}
-        if isinstance(token, PeerRelay):
-            assert keys.relay_token(token) == key
-        elif token is not None:
-            assert keys.client_token(token) == key
+        assert token is None or keys.relay_token(token) == key
 
 
 @pytest.mark.parametrize("key", ["me/you/0", "relay/you/1/1/1/-", "at/robot/you/1/1", "sern/2/h/me/you/0"])
@@ -58,8 +49,6 @@ def test_a_name_that_means_something_in_a_key_expression_is_refused(name: str) -
         lambda: keys.hop_key(good, bad, PriorityClass.BULK),
         lambda: keys.inbox(bad),
         lambda: keys.relay_token(PeerRelay(bad, 1, (1, 1), "")),
-        lambda: keys.client_token(Claim(bad, good, 1, 1)),
-        lambda: keys.client_token(Claim(good, bad, 1, 1)),
     ]
     for make in makers:
         with pytest.raises(UsageError, match="client name"):

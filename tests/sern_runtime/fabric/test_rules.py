@@ -12,15 +12,13 @@ import pytest
 from sern_core.vocabulary.types import ClientName, PriorityClass
 from sern_runtime.config.fabric import CertificateFiles
 from sern_runtime.fabric import keys
-from sern_runtime.fabric.port import Claim, PeerRelay
+from sern_runtime.fabric.port import PeerRelay
 from sern_runtime.fabric.zenoh_settings import FabricOptions, settings
 from sern_tools.ports import free_ports
 from tests.sern_runtime.fabric.relays import BOOT, A, B, C, files, options, running
 from tests.support import until
 
 zenoh = pytest.importorskip("zenoh", reason="zenoh is not installed")
-
-ROBOT = ClientName("robot1")
 
 
 @contextmanager
@@ -41,7 +39,7 @@ def put(session: Any, destination: ClientName, source: ClientName, body: bytes) 
 
 
 async def test_a_relay_speaks_for_itself_alone(certificates: Path) -> None:
-    """B has its own certificate, and tries to send, to be told and to claim as C."""
+    """B has its own certificate, and tries to send, to be told and to be there as C."""
     (port,) = free_ports(1)
     mine, theirs = files(certificates, A), files(certificates, B)
     async with running(options(A, listen=port, certificates=mine)) as (a,):
@@ -49,15 +47,11 @@ async def test_a_relay_speaks_for_itself_alone(certificates: Path) -> None:
             heard: list[str] = []
             spied = session.declare_subscriber(f"{keys.ROOT}/**", lambda sample: heard.append(str(sample.key_expr)))
             inbox = session.declare_subscriber(keys.inbox(B), lambda sample: heard.append(str(sample.key_expr)))
-            of_c = [
-                session.liveliness().declare_token(keys.relay_token(PeerRelay(C, 1, (1, 1), ""))),
-                session.liveliness().declare_token(keys.client_token(Claim(ROBOT, C, 1, 1))),
-                session.liveliness().declare_token(keys.client_token(Claim(ROBOT, A, 1, 1))),
-            ]
+            of_c = session.liveliness().declare_token(keys.relay_token(PeerRelay(C, 1, (1, 1), "")))
             # In the order in which they were said: what comes after all that has come, and nothing of it.
             own = session.liveliness().declare_token(keys.relay_token(PeerRelay(B, 1, (1, 1), "")))
             await a.until(lambda: a.told.peers)
-            assert (set(a.told.peers), a.told.claims) == ({B}, set())
+            assert set(a.told.peers) == {B}
             put(session, A, C, b"as c")
             put(session, A, A, b"as the relay itself")
             session.put(

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from sern_core.vocabulary.errors import ConfigError
-from sern_core.vocabulary.types import CLASSES, ClientName, PriorityClass
+from sern_core.vocabulary.types import CLASSES, PriorityClass
 from sern_core.wire.framing import MAX_DATAGRAM_BYTES, VERSIONS
-from sern_runtime.fabric.port import Claim, FabricDrop, PeerRelay
+from sern_runtime.fabric.port import FabricDrop, PeerRelay
 from sern_runtime.fabric.zenoh_port import ZenohPort
 from sern_runtime.fabric.zenoh_settings import WHOLE_BYTES
 from sern_tools.ports import free_ports
@@ -32,7 +32,6 @@ from tests.sern_runtime.fabric.relays import (
 
 pytest.importorskip("zenoh", reason="zenoh is not installed")
 
-ROBOT = ClientName("robot1")
 AGAIN_S = 1.0
 LEASE_S = 0.5
 
@@ -84,33 +83,11 @@ async def test_two_relays_meet_send_and_part(certificates: Path, secured: bool) 
         assert [kind for kind, _ in b.told.news] == ["up", "down"]
 
 
-async def test_claims_follow_their_client(certificates: Path) -> None:
-    first, second = chain(certificates)
-    async with running(first, second) as (a, b):
-        b.port.claim(ROBOT, 3)  # before anybody is there to be told
-        await a.until(lambda: Claim(ROBOT, B, BOOT, 3) in a.told.claims)
-        b.port.claim(ROBOT, 4)
-        await a.until(lambda: a.told.claims == {Claim(ROBOT, B, BOOT, 4)})
-        kinds = [kind for kind, what in a.told.news if isinstance(what, Claim)]
-        assert kinds == ["claimed", "claimed", "released"]  # never without one in between
-        b.port.claim(ROBOT, 4)
-        b.port.release(ROBOT)
-        b.port.release(ROBOT)
-        await a.until(lambda: not a.told.claims)
-        b.port.claim(ROBOT, 5)
-        await a.until(lambda: a.told.claims)
-        assert a.port.counters.claims == 1
-        await b.port.close()
-        await a.until(lambda: not a.told.claims and not a.told.peers)
-        assert b.told.claims == set()  # never of its own
-
-
 async def test_who_comes_late_is_told_what_is_there() -> None:
     first, second = chain()
     async with running(first) as (a,):
-        a.port.claim(ROBOT, 1)
         async with running(second) as (b,):
-            await b.until(lambda: b.told.peers and b.told.claims)
+            await b.until(lambda: b.told.peers)
             await a.until(lambda: a.told.peers)
         await a.until(lambda: ("down", (B, BOOT)) in a.told.news)
         # A new process of the same name, while the port of the old one is known to be gone.
@@ -180,12 +157,9 @@ async def test_relays_between_which_there_is_no_connection(certificates: Path, s
         await a.until(lambda: B in a.told.peers)
         await c.until(lambda: B in c.told.peers)
         # What B was told by C has come to A as well, by now, if it comes at all.
-        c.port.claim(ROBOT, 1)
-        await b.until(lambda: b.told.claims)
-        b.port.claim(ClientName("robot2"), 1)
-        await a.until(lambda: a.told.claims)
+        await send_until(c, b, b"to the middle", PriorityClass.CONTROL)
+        await send_until(b, a, b"and on", PriorityClass.CONTROL)
         assert (set(a.told.peers), set(c.told.peers)) == ({B}, {B})
-        assert [claim.client for claim in a.told.claims] == ["robot2"]
 
 
 @pytest.mark.parametrize("how", ["cut", "silent"])
@@ -201,15 +175,13 @@ async def test_a_connection_that_is_gone_for_a_while(certificates: Path, how: st
         )
         async with running(*chosen) as (a, b, c):
             await meet(a, b, c)
-            c.port.claim(ROBOT, 1)
-            await a.until(lambda: a.told.claims)
             wire.close_door(cut=how == "cut")
-            await a.until(lambda: C not in a.told.peers and not a.told.claims)
+            await a.until(lambda: C not in a.told.peers)
             await c.until(lambda: A not in c.told.peers)
             assert set(b.told.peers) == {A, C}
             assert not c.port.send(A, PriorityClass.CONTROL, b"nobody there")
             wire.open_door()
-            await a.until(lambda: C in a.told.peers and a.told.claims == {Claim(ROBOT, C, BOOT, 1)})
+            await a.until(lambda: C in a.told.peers)
             await c.until(lambda: A in c.told.peers)
             await send_until(c, a, b"again", PriorityClass.CONTROL)
         wire.open_door()
@@ -220,12 +192,10 @@ async def test_relays_at_a_router_of_somebody_else() -> None:
     (port,) = free_ports(1)
     chosen = [options(name, connect=[port], external=True) for name in (A, B)]
     async with running(*chosen) as (a, b):
-        b.port.claim(ROBOT, 1)
         with external_router(port):
             await meet(a, b)
             await send_until(a, b, b"through the router", PriorityClass.STATE)
-            await a.until(lambda: a.told.claims)
-        await a.until(lambda: not a.told.peers and not a.told.claims)
+        await a.until(lambda: not a.told.peers)
 
 
 async def test_leaving_while_no_router_answers() -> None:
@@ -256,5 +226,3 @@ async def test_closing_twice_and_without_a_start() -> None:
     await port.close()
     await port.close()
     assert not port.send(B, PriorityClass.BULK, b"x")
-    port.claim(ROBOT, 1)
-    port.release(ROBOT)
