@@ -1,6 +1,6 @@
 """Two bare `Link`s of one hop, without relay or client around them, and what the one got of the other."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from sern_core.link.definitions import DefinitionStore
 from sern_core.link.lane_port import LanePort
@@ -26,7 +26,11 @@ class BareEnd:
         self, name: ClientName, peer: ClientName, *, initiator: bool, now: float, lossless: bool, any_size: bool
     ) -> None:
         self.got: list[bytes] = []
+        self.take: Callable[[bytes], object] = self.got.append
+        """What is done with what arrives."""
         self.faults: list[Exception] = []
+        self.downs: list[str] = []
+        """Why sessions have ended."""
         self.link = Link(
             name=name,
             boot=1,
@@ -57,14 +61,17 @@ class BareEnd:
 
     def on_message(self, link: Link, stream: InStream, message: Message, *, now: float) -> None:
         del link, stream, now
-        self.got.append(bytes(message.body))
+        self.take(bytes(message.body))
 
     def on_fault(self, link: Link, error: Exception, *, now: float) -> None:
         del link, now
         self.faults.append(error)
 
+    def on_down(self, link: Link, reason: str, *, now: float) -> None:
+        del link, now
+        self.downs.append(reason)
+
     def on_up(self, link: Link, *, resumed: bool, now: float) -> None: ...
-    def on_down(self, link: Link, reason: str, *, now: float) -> None: ...
     def on_lane_closed(self, link: Link) -> None: ...
     def on_rejected(self, link: Link, code: str, text: str, *, now: float) -> None: ...
     def on_retract(self, link: Link, stream: InStream, *, now: float) -> None: ...
