@@ -56,7 +56,7 @@ class RelayEntry:
 
     @property
     def address(self) -> str:
-        """As the file has it."""
+        """Its address as the file has it."""
         return self.section.endpoint
 
     @property
@@ -93,7 +93,7 @@ class Relays:
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
         self._random = Random(secrets.randbits(64))
         self.entries = [RelayEntry(i, each, self._keyring(i, each)) for i, each in enumerate(model.all_relays)]
-        """In the order of preference."""
+        """The relays in the order of preference."""
         self.choice = RelayChoice(
             [each.handshake_interval_s for each in model.all_relays],
             failover_s=model.failover.failover_s,

@@ -384,7 +384,7 @@ class RelayDaemon:
 
     @property
     def fabric_counters(self) -> FabricCounters | None:
-        """Of the port to other relays; None: it is not there yet."""
+        """The counters of the port to other relays; None: it is not there yet."""
         return None if self.fabric is None else self.fabric.port.counters
 
     def reload(self) -> None:

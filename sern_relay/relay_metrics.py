@@ -50,7 +50,7 @@ class Counting(Protocol):
 
     @property
     def fabric_counters(self) -> FabricCounters | None:
-        """Of the port to other relays; None: it is not there yet."""
+        """The counters of the port to other relays; None: it is not there yet."""
 
     def clients_up(self) -> int:
         """Clients with a session."""

@@ -43,7 +43,8 @@ def _announcement(*, kept: bool = False) -> Vector:
 
 
 def control_messages() -> list[Vector]:
-    """Without their bytes."""
+    """The messages without their bytes."""
+    digest = definition_hash(DEFINITION)
     return [
         _control("announce", "a stream on channel 3 of its sender", _announcement()),
         _control("announce-kept", "the same stream, reliable and kept on disk by its origin", _announcement(kept=True)),
@@ -79,10 +80,8 @@ def control_messages() -> list[Vector]:
             "the same, and several channels may be answered at once",
             {"t": "synced", "batch": True},
         ),
-        _control("need", "asks for a definition", {"t": "need", "dh": definition_hash(DEFINITION)}),
-        _control(
-            "define", "the definition, packed with zlib", {"t": "define", "dh": definition_hash(DEFINITION)}, DEFINITION
-        ),
+        _control("need", "asks for a definition", {"t": "need", "dh": digest}),
+        _control("define", "the definition, packed with zlib", {"t": "define", "dh": digest}, DEFINITION),
         _control(
             "dropped-run",
             "a later hop gave up seq 41, 42 and 43 of channel 3",

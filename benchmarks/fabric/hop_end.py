@@ -5,34 +5,24 @@ The robot's end announces a stream of each class and offers messages; the site's
 
 import asyncio
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from benchmarks.link.load import Kind, Load, Log, Orders, Spec, offer, ready
-from sern_core.link.definitions import DefinitionStore
-from sern_core.link.link import Link
-from sern_core.stream.in_stream import InStream
+from benchmarks.link.load import Kind, Load, Log, Orders, Spec, offer, ready, take_all
 from sern_core.stream.out_channel import OutChannel
-from sern_core.stream.out_message import OutMessage
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
-from sern_core.vocabulary.params import LinkParams, SchedulerParams
-from sern_core.vocabulary.trace import DecisionTrace
-from sern_core.vocabulary.types import ClientName, DropReason, Encoding, PriorityClass, TopicName
-from sern_core.wire import framing
-from sern_core.wire.announce import Announcement
+from sern_core.vocabulary.types import ClientName, Encoding, PriorityClass, TopicName
 from sern_runtime import clock
 from sern_runtime.config.fabric import CA_FILE, CertificateFiles, certificate_file, key_file
 from sern_runtime.fabric.hop import ANY_SIZE, LOSSLESS, FabricHop
 from sern_runtime.fabric.port import PeerRelay
 from sern_runtime.fabric.zenoh_port import ZenohPort
 from sern_runtime.fabric.zenoh_settings import FabricOptions
-from tests.two_links import HelloPort
+from tests.two_links import BareEnd
 
 PORT: Final = 7447
 ROBOT: Final = ClientName("robot")
 SITE: Final = ClientName("site")
-POLL_S: Final = 0.02
 VARIANTS: Final = {
     "fabric": (LOSSLESS, ANY_SIZE),
     "fabric, 1171 B": (False, False),
@@ -55,30 +45,18 @@ def options(spec: Spec, name: ClientName, other: ClientName) -> FabricOptions:
 
 
 class HopEnd:
-    """Owns link, port and pump of one end; is told by both (`LinkHandler`, `FabricEvents`)."""
+    """Owns link, port and pump of one end; is told by the port (`FabricEvents`)."""
 
     def __init__(self, spec: Spec, log: Log) -> None:
-        self._log = log
         self.own, self.other = (ROBOT, SITE) if spec.sends else (SITE, ROBOT)
-        self.heard_peer = asyncio.Event()
-        self.faults: list[str] = []
         lossless, any_size = VARIANTS[spec.system]
-        self.link = Link(
-            name=self.own,
-            boot=1,
-            peer=self.other,
-            initiator=spec.sends,
-            handler=self,
-            definitions=DefinitionStore(),
-            link=LinkParams(),
-            scheduler=SchedulerParams(),
-            trace=DecisionTrace(),
-            now=clock.now(),
-            lossless=lossless,
-            any_size=any_size,
+        end = self.end = BareEnd(
+            self.own, self.other, initiator=spec.sends, now=clock.now(), lossless=lossless, any_size=any_size
         )
+        end.take = log.arrived
+        self.link = end.link
         self.port = ZenohPort(options(spec, self.own, self.other), self)
-        self.hop = FabricHop(self.port, self.other, HelloPort(self.link))
+        self.hop = FabricHop(self.port, self.other, end.port)
 
     def open(self, priority: PriorityClass) -> OutChannel:
         """A best-effort stream of a class, as a relay would pass it on."""
@@ -104,7 +82,7 @@ class HopEnd:
             "acked": self.link.lane.acked_packets,
             "lost": self.link.lane.lost_packets,
             "fragment_bytes": self.link.lane.fragment_bytes,
-            "faults": self.faults,
+            "faults": [*map(repr, self.end.faults), *self.end.downs],
         }
 
     # --- FabricEvents -------------------------------------------------------------------------------------------------
@@ -121,37 +99,6 @@ class HopEnd:
     def arrived(self, source: ClientName, datagram: bytes) -> None:
         del source
         self.hop.arrived(datagram)
-
-    # --- LinkHandler --------------------------------------------------------------------------------------------------
-
-    def on_announce(self, link: Link, announcement: Announcement, *, now: float) -> bool:
-        del link, announcement, now
-        return True
-
-    def on_message(self, link: Link, stream: InStream, message: Message, *, now: float) -> None:
-        del link, stream, now
-        self._log.arrived(message.body)
-
-    def on_fault(self, link: Link, error: Exception, *, now: float) -> None:
-        del link, now
-        self.faults.append(repr(error))
-
-    def on_down(self, link: Link, reason: str, *, now: float) -> None:
-        del link, now
-        self.faults.append(f"down: {reason}")
-
-    def on_up(self, link: Link, *, resumed: bool, now: float) -> None: ...
-    def on_lane_closed(self, link: Link) -> None: ...
-    def on_rejected(self, link: Link, code: str, text: str, *, now: float) -> None: ...
-    def on_retract(self, link: Link, stream: InStream, *, now: float) -> None: ...
-    def on_in_drop(self, link: Link, stream: InStream, reason: DropReason, nbytes: int, count: int) -> None: ...
-    def on_out_drop(self, link: Link, channel: OutChannel, outs: Sequence[OutMessage], reason: DropReason) -> None: ...
-    def on_delivered(self, link: Link, channel: OutChannel, *, now: float) -> None: ...
-    def on_wanted(self, link: Link, channel: OutChannel, *, now: float) -> None: ...
-    def on_refused(self, link: Link, channel: OutChannel, code: str, text: str, *, now: float) -> None: ...
-    def on_skipped(self, link: Link, stream: InStream, count: int, *, now: float) -> None: ...
-    def on_definition(self, link: Link, digest: str, *, now: float) -> None: ...
-    def on_control(self, link: Link, envelope: framing.Envelope, attachment: bytes, *, now: float) -> None: ...
 
 
 def sender(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str, Any]:
@@ -176,13 +123,7 @@ def receiver(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str, Any]
 async def _receive(spec: Spec, orders: Orders, log: Log) -> dict[str, Any]:
     end = HopEnd(spec, log)
     await end.port.start()
-    said = False
-    while not orders.stopped:
-        await asyncio.sleep(POLL_S)
-        if log.heard and not said:
-            said = True
-            ready()
-        orders.poll()
+    await take_all(orders, log)
     return await _stop(end)
 
 
@@ -194,7 +135,7 @@ async def _stop(end: HopEnd) -> dict[str, Any]:
 
 
 def certificates(directory: Path) -> None:
-    """Of both ends, in the folder of a run."""
+    """Make those of both ends, in the folder of a run."""
     from sern_tools.keygen_fabric import make_fabric
 
     make_fabric([ROBOT, SITE], out=directory)

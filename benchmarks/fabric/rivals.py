@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Final
 
-from benchmarks.fabric.hop_end import POLL_S, ROBOT, SITE, options
-from benchmarks.link.load import Kind, Load, Log, Orders, Spec, offer, ready
+from benchmarks.fabric.hop_end import ROBOT, SITE, options
+from benchmarks.link.load import POLL_S, Kind, Load, Log, Orders, Spec, offer, ready, take_all
 from benchmarks.link.peers import drive, listen
 from sern_core.vocabulary.errors import SernError
 from sern_runtime.fabric.zenoh_settings import settings
@@ -127,13 +127,7 @@ def nats_receiver(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str,
         reader, writer = await _connect()
         writer.write(b"SUB bench.* 1\r\n")
         taking = asyncio.create_task(_answer(reader, writer, log))
-        said = False
-        while not orders.stopped:
-            await asyncio.sleep(POLL_S)
-            if log.heard and not said:
-                said = True
-                ready()
-            orders.poll()
+        await take_all(orders, log)
         taking.cancel()
         writer.close()
 

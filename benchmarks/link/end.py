@@ -3,15 +3,11 @@
 It says `ready` on standard output when messages pass, and leaves ROLE.npy (its log) and ROLE.json (what else it saw).
 """
 
-import json
-import sys
-from collections.abc import Callable
-from typing import Any, Final
+from typing import Final
 
 from benchmarks.link import forwarder, peers, sern
-from benchmarks.link.load import Load, Log, Orders, Spec
+from benchmarks.link.load import End, play
 
-End = Callable[[Spec, Load, Orders, Log], dict[str, Any]]
 ENDS: Final[dict[str, tuple[End, End]]] = {
     "floor": (peers.udp_sender, peers.udp_receiver),
     forwarder.FORWARDER: (forwarder.sender, forwarder.receiver),
@@ -27,14 +23,5 @@ ENDS: Final[dict[str, tuple[End, End]]] = {
 """Sender and receiver of each system."""
 
 
-def main() -> None:
-    spec = Spec(**json.loads(sys.argv[1]))
-    sender, receiver = ENDS[spec.system]
-    log = Log()
-    seen = (sender if spec.sends else receiver)(spec, Load(**spec.load), Orders(), log)
-    log.save(spec.path / f"{spec.role}.npy")
-    (spec.path / f"{spec.role}.json").write_text(json.dumps(seen))
-
-
 if __name__ == "__main__":
-    main()
+    play(ENDS)

@@ -18,8 +18,8 @@ from typing import Any, Final, Self
 
 import uvloop
 
-from benchmarks.link.load import Kind, Load, Log, Orders, Spec
-from benchmarks.link.peers import NOTHING, POLL_S, PORT, drive, listen, send_datagram
+from benchmarks.link.load import POLL_S, Kind, Load, Log, Orders, Spec
+from benchmarks.link.peers import NOTHING, PORT, drive, listen, send_datagram
 from benchmarks.link.sern import RELAY_PORT
 from sern_runtime.seal import UDP_PAYLOAD_BYTES, Opener, Sealer, SessionParameters, Side, offered_ciphers
 

@@ -4,11 +4,14 @@ Every message begins with its kind, its number (from 1; 0 is a hello before the 
 handed to the system, by the host's monotonic clock, which all network namespaces share.
 """
 
+import asyncio
+import json
 import os
 import random
 import select
+import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from heapq import merge
@@ -22,6 +25,7 @@ from numpy.typing import NDArray
 READY: Final = b"ready"
 HELLO: Final = 0
 HELLO_PERIOD_S: Final = 0.05
+POLL_S: Final = 0.02
 JITTER_S: Final = 0.020
 """Large messages come up to so much later than their period says, or each would always meet the same poses."""
 _HEAD: Final = Struct("!BIQ")
@@ -151,6 +155,17 @@ def ready() -> None:
     os.write(1, READY + b"\n")
 
 
+async def take_all(orders: Orders, log: Log) -> None:
+    """Say `ready` once something has arrived, and return when the run is over."""
+    said = False
+    while not orders.stopped:
+        await asyncio.sleep(POLL_S)
+        if log.heard and not said:
+            said = True
+            ready()
+        orders.poll()
+
+
 def offer(load: Load, duration_s: float, orders: Orders, log: Log, send: Send) -> Iterator[float]:
     """The sender's life, as pauses in seconds for its caller to keep: hellos until told to go, the load, the end."""
     hello = _HEAD.pack(Kind.POSE, HELLO, 0).ljust(POSES.size_bytes, b"\0")
@@ -195,3 +210,17 @@ class Spec:
     @property
     def role(self) -> str:
         return "robot" if self.sends else "site"
+
+
+End = Callable[[Spec, Load, Orders, Log], dict[str, Any]]
+"""One end of a system: plays its part until it is told to stop, and returns what it saw beside the messages."""
+
+
+def play(ends: Mapping[str, tuple[End, End]]) -> None:
+    """Be the end that the first argument says: of a system its sender or its receiver."""
+    spec = Spec(**json.loads(sys.argv[1]))
+    sender, receiver = ends[spec.system]
+    log = Log()
+    seen = (sender if spec.sends else receiver)(spec, Load(**spec.load), Orders(), log)
+    log.save(spec.path / f"{spec.role}.npy")
+    (spec.path / f"{spec.role}.json").write_text(json.dumps(seen))

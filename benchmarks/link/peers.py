@@ -10,11 +10,10 @@ from typing import Any, Final
 
 import zmq
 
-from benchmarks.link.load import Kind, Load, Log, Orders, Spec, offer, ready
+from benchmarks.link.load import POLL_S, Kind, Load, Log, Orders, Spec, offer, ready
 from benchmarks.zenoh_session import open_session
 
 PORT: Final = 7447
-POLL_S: Final = 0.02
 NOTHING: Final[dict[str, Any]] = {}
 ROS_PACKAGES: Final = Path("/usr/lib/python3/dist-packages")
 ROS_MASTER: Final = f"import sys; sys.path.append({str(ROS_PACKAGES)!r}); import rosmaster; rosmaster.rosmaster_main()"

@@ -219,7 +219,7 @@ class StreamsIn:
         stream.channel_id = None
 
     def _remember(self, stream: InStream) -> None:
-        """Where a durable stream ends, for `_recall`; the latest of them."""
+        """Keep where a durable stream ends, for `_recall`; the latest of them are kept."""
         if not stream.stream.spec.durable:
             return
         delivered = stream.unhandled - 1 if stream.unhandled else stream.delivered

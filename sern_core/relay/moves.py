@@ -30,7 +30,7 @@ from sern_core.vocabulary.names import is_peer
 from sern_core.vocabulary.types import ClientName, DropReason, TopicName
 
 PATIENCE_S: Final = 5.0
-"""How long a home waits for `go`. A source that does not answer for so long has died: whoever takes its place knows
+"""A home waits so long for `go`. A source that does not answer for so long has died: whoever takes its place knows
 from the origin for whom the stream is."""
 MAX_HELD_BACK: Final = 1000
 """Messages of one stream that are held back for a client meanwhile; with more it begins behind them."""

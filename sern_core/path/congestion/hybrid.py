@@ -129,7 +129,7 @@ class HybridWindow(CapacityEstimator):
 
     @property
     def unqueued_bytes(self) -> float:
-        """As much as the window while that finds out what the link carries, or shares it with somebody else."""
+        """The window itself while that finds out what the link carries, or shares the link with somebody else."""
         rtt_s, rate = self._path.rtt_s, self._rate.value
         if self._mode is not STEADY or rate is None or rtt_s is None or not self._rate.saturated:
             return self.window_bytes

@@ -1,4 +1,4 @@
-"""How much more than the path holds may be under way of what nobody waits for. Pure."""
+"""Bytes beyond what the path holds that background traffic may have under way. Pure."""
 
 from typing import Final
 
@@ -7,7 +7,7 @@ from sern_core.path.congestion.queue_view import QueueView
 LESS_FRAGMENTS: Final = 0.25
 FIRST_FRAGMENTS: Final = 0.05
 PATIENT_EPOCHS: Final = 4
-"""So many epochs without a queue, and what is known of the rate may be too little."""
+"""Epochs without a queue after which the known rate may be too low."""
 MOST_DOUBLINGS: Final = 6
 
 
