@@ -236,7 +236,8 @@ class Connection:
             return
         self.transport.pump.run()
         link = self._core.link
-        if link.established and not link.lane.stalled:
+        # Nothing waits for it while the client goes on: then it is worth trying on a link that stands still, too.
+        if link.established and (moved or not link.lane.stalled):
             self._linger_s = LINGER_S
         link.close(why, now=clock.now(), moved=moved)
         self.transport.pump.run()

@@ -4,11 +4,12 @@ Without a directory (`insecure: true`) everybody may.
 """
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
 from sern_core.vocabulary.types import ClientName
-from sern_runtime.config.keys import KeyDirectory, KeyStatus, clock_says, fingerprint, user_id
+from sern_runtime.config.keys import KeyDirectory, KeyStatus, PublicKey, clock_says, fingerprint, user_id
 from sern_runtime.zap import Refusal, TemporaryRefusal
 
 ZAP_DOMAIN: Final = "sern"
@@ -19,11 +20,30 @@ class Admission:
 
     def __init__(self, directory: KeyDirectory | None) -> None:
         self.directory = directory
+        self.overruled: tuple[tuple[ClientName, PublicKey], ...] = ()
+        """Keys of the directory that hold no more because they were revoked at another relay."""
+        self._revoked: dict[str, tuple[ClientName, PublicKey]] = {}  # at other relays, as they were told
         self._valid = self._valid_keys()
 
     def replace(self, directory: KeyDirectory | None) -> None:
         """Put `directory` in force. What it takes away is told by the next `take_lapsed`."""
         self.directory = directory
+        self.overruled = () if directory is None else directory.revoke(self._revoked)
+
+    def own_revoked(self) -> list[tuple[ClientName, PublicKey]]:
+        """What is revoked in the directory, without what other relays have told."""
+        revoked = () if self.directory is None else self.directory.revoked()
+        return [(name, key) for name, key in revoked if key.key not in self._revoked]
+
+    def revoke(self, keys: Mapping[str, tuple[ClientName, PublicKey]]) -> tuple[tuple[ClientName, PublicKey], ...]:
+        """Keys that were revoked at another relay hold no more, whatever directory is put in force. What that takes
+        away is told by the next `take_lapsed`. Returns those that the directory had, with their names there."""
+        self._revoked.update(keys)
+        return () if self.directory is None else self.directory.revoke(keys)
+
+    def has(self, public_key: str) -> bool:
+        """Whether the directory has this key, revoked or not."""
+        return self.directory is not None and self.directory.lookup(public_key, at_s=time.time()).name is not None
 
     def known(self, client: ClientName) -> bool:
         """Whether the name is in the directory."""

@@ -7,6 +7,7 @@ Known are the names of the directory of keys, and whoever has a link or had one.
     away        it was lost, and is waited for: `why`
     forgotten   it was lost or said goodbye, and nothing is kept for it
     never       its key is known here, and it has not come since the relay began
+    at RELAY    it is at another relay; of the way there is nothing known here
 
 The answer is made a few rows in a turn of the loop.
 """
@@ -18,16 +19,19 @@ from typing import Any, Final
 
 from sern_core.link.link import Link
 from sern_core.relay.hub import Hub
-from sern_core.vocabulary.names import is_peer
+from sern_core.vocabulary.names import PEER_SIGN, is_peer
 from sern_core.vocabulary.types import ClientName
 from sern_relay.admission import Admission
 from sern_relay.comings import Coming, Comings
+from sern_relay.fleet import relay_of
 from sern_relay.refusals import Refusals
 from sern_runtime import clock
 from sern_runtime.events import wall_text
 from sern_runtime.http_routes import JsonParts, closing_array
 
 TOO_LARGE: Final = "the answer is too large"
+ELSEWHERE: Final = "at "
+"""How the state of a client of another relay begins."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,8 @@ class ClientsSource:
 
     def names(self) -> list[ClientName]:
         """Everybody who is known."""
-        names = {*self.admission.names, *self.hub.links, *self.comings.clients}
+        elsewhere = (client for client, _peer in self.hub.peers.at())
+        names = {*self.admission.names, *self.hub.links, *self.comings.clients, *elsewhere}
         return sorted(name for name in names if not is_peer(name))
 
 
@@ -59,7 +64,7 @@ def client_row(source: ClientsSource, client: ClientName) -> dict[str, Any]:
     """One client, as it is now; what is not known is None."""
     now, wall_s = clock.now(), time.time()
     link, coming = source.hub.links.get(client), source.comings.clients.get(client)
-    state = _state(link, coming)
+    state = _state(link, coming, source.hub.peers.home(client))
     view = None if link is None else link.observe(now=now)
     up = view is not None and view.established
     heard_at_s = link.heard_s if link is not None else coming.heard_s if coming is not None else None
@@ -69,7 +74,8 @@ def client_row(source: ClientsSource, client: ClientName) -> dict[str, Any]:
     return {
         "name": client,
         "state": state,
-        "why": coming.why if coming is not None else "",
+        "relay": None if state in ("never", "forgotten") else relay_of(source.hub, client),
+        "why": coming.why if coming is not None and not state.startswith(ELSEWHERE) else "",
         "address": known or None,
         "lane": view.lane if view is not None and up else None,
         "since": None if since_s is None else wall_text(wall_s - since_s),
@@ -86,9 +92,11 @@ def client_row(source: ClientsSource, client: ClientName) -> dict[str, Any]:
     }
 
 
-def _state(link: Link | None, coming: Coming | None) -> str:
+def _state(link: Link | None, coming: Coming | None, peer: ClientName | None) -> str:
     if link is not None and link.established:
         return "silent" if link.lane.stalled else "connected"
+    if peer is not None:
+        return ELSEWHERE + peer.removeprefix(PEER_SIGN)
     if coming is None:
         return "never"
     return "away" if link is not None and coming.waited_for else "forgotten"

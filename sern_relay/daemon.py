@@ -5,6 +5,7 @@ import json
 import logging
 import secrets
 import time
+from collections.abc import Sequence
 from contextlib import AsyncExitStack
 from functools import partial
 from pathlib import Path
@@ -21,9 +22,9 @@ from sern_core.relay.traces import Traces
 from sern_core.stream.out_channel import OutChannel
 from sern_core.topics.rules import FeedRole
 from sern_core.vocabulary.errors import ConfigError
-from sern_core.vocabulary.key_news import ClientKeys
+from sern_core.vocabulary.key_news import ClientKeys, KeyRevocation
 from sern_core.vocabulary.message import Message, StreamInfo
-from sern_core.vocabulary.names import PEER_SIGN
+from sern_core.vocabulary.names import PEER_SIGN, is_peer
 from sern_core.vocabulary.types import ClientName
 from sern_relay.admission import ZAP_DOMAIN, Admission, read_directory
 from sern_relay.comings import Comings
@@ -33,6 +34,7 @@ from sern_relay.keyring import OwnKeys, RelayKeyring
 from sern_relay.readers import Readers
 from sern_relay.refusals import Refusals
 from sern_relay.relay_metrics import register_relay
+from sern_relay.revocations import FabricRevocations
 from sern_relay.server import RelayServer
 from sern_relay.transforms import TransformObjects
 from sern_relay.udp import RelayLanes
@@ -72,11 +74,13 @@ PATIENCE_S: Final = 5.0
 SWEEP_S: Final = 1.0
 OTHER_FILES: Final = 128
 """What a relay has open beside the connections of clients."""
+RULES: Final = "rules"
+"""The kind of events of other relays' access rules."""
 OTHER_CODE: Final = "other"
 REFUSAL_CODES: Final = frozenset({
     "bad_announcement", "bad_id", "bad_name", "bad_object", "bad_pattern", "displaced", "forbidden",
-    "internal_error", "name_taken", "not_owner", "old_boot", "origin", "registry_full", "too_large", "too_many_objects",
-    "too_many_patterns", "too_many_streams", "type_mismatch",
+    "bad_rules", "internal_error", "name_taken", "not_owner", "old_boot", "origin", "registry_full", "too_large",
+    "too_many_objects", "too_many_patterns", "too_many_rules", "too_many_streams", "type_mismatch",
 })  # fmt: skip
 """What a refusal is counted under; a code that a client made up is counted as `other`."""
 
@@ -153,7 +157,8 @@ class RelayDaemon:
         self.codecs = CodecPool(after=self._after, parts=self.parts)
         self.coder = make_coder(model.link.params(), self.codecs)
         self.readers = Readers(self.coder, self.parts, self.errors)
-        self._comings = Comings(self.events, remembered=self.admission.named, address=self._address)
+        self._comings = Comings(self.events, relay=model.name, remembered=self.admission.named, address=self._address)
+        self.revocations = FabricRevocations(self.hub, self.admission, self.events, enforce=self._enforce)
         self.views = RelayViews(
             model.name, self.hub, self._comings, self.turned_away, self.events, self.admission, self._address
         )
@@ -227,7 +232,9 @@ class RelayDaemon:
         with blamed_on(self.loaded.path, "relay", "max_connections"):
             require_open_files(relay.max_connections + OTHER_FILES)
         self._ctx = zmq.Context()
-        self.readers.transforms = TransformObjects(self.hub.objects, parts=self.parts)
+        self.readers.transforms = TransformObjects(
+            self.hub.objects, parts=self.parts, elsewhere=lambda stream: self.hub.routing.via(stream) is not None
+        )
         if own is not None:
             self.zap = ZapHandler(self._ctx, refused=self.turned_away.refuse)
             self.zap.add_domain(ZAP_DOMAIN, self.admission.lookup)
@@ -238,7 +245,9 @@ class RelayDaemon:
                 overlap_s=relay.overlap_s,
                 session_key=lambda client: self.server.session_key(client) if self.server is not None else None,
                 after=self._after,
+                relays=lambda: {} if self.fabric is None else self.fabric.reached(),
             )
+        self.revocations.read()
         with blamed_on(self.loaded.path, "relay", "listen"):
             self.server = RelayServer(
                 self._ctx,
@@ -303,6 +312,19 @@ class RelayDaemon:
             self.events.say(_log, logging.WARNING, "key_lost", client, "%s lost a key; %d connections cut", client, cut)
             if not stays:
                 self.hub.clients.end_session(client, "the key no longer holds", now=clock.now())
+
+    def _enforce(self) -> None:
+        """End what was made with keys, or under names, that hold no more."""
+        if self.server is not None:
+            self.server.cut_unbound()  # admitted by the old keys, and silent so far
+        self._end_lapsed()
+        for client in [name for name in self.hub.links if not (is_peer(name) or self.admission.known(name))]:
+            self.events.say(
+                _log, logging.WARNING, "key_lost", client,
+                "%s is in the directory no more; what was held for it is dropped", client,
+            )  # fmt: skip
+            self.hub.forget(client, "the name is revoked", now=clock.now())
+        self._after()
 
     def _after(self) -> None:
         """Something came in: before the loop comes round again, whoever has something to send sends it."""
@@ -387,6 +409,16 @@ class RelayDaemon:
         """The counters of the port to other relays; None: it is not there yet."""
         return None if self.fabric is None else self.fabric.port.counters
 
+    @property
+    def relays(self) -> "RelayFabric | None":
+        """Other relays; None: there is no fabric, or not yet."""
+        return self.fabric
+
+    @property
+    def takeovers(self) -> int:
+        """Sessions that another process took under its client's name."""
+        return self._comings.takeovers
+
     def reload(self) -> None:
         """SIGHUP: read keys, access rules and the feed's roles anew; all or nothing. What was revoked ends now."""
         self.notifier.reloading()
@@ -405,22 +437,14 @@ class RelayDaemon:
         self.reloads.read()
         log_warnings(_log, loaded.warnings)
         self.admission.replace(directory)
+        self.revocations.read()
         now = clock.now()
         self.hub.revoke(access, now=now)
         with self.parts.survive("feed"):
             self._update_feed(loaded.model, now)
         if own is not None:
             self._use_keys(own, loaded.model)
-        if self.server is not None:
-            self.server.cut_unbound()  # admitted by the old keys, and silent so far
-        self._end_lapsed()
-        for client in [name for name in self.hub.links if not self.admission.known(name)]:
-            self.events.say(
-                _log, logging.WARNING, "key_lost", client,
-                "%s is in the directory no more; what was held for it is dropped", client,
-            )  # fmt: skip
-            self.hub.forget(client, "the name is revoked", now=now)
-        self._after()
+        self._enforce()
         self.notifier.ready(self._status())
         self._in_force(now)
         words = "reloaded keys, access rules and feed roles; other changes need a restart"
@@ -542,6 +566,7 @@ class RelayDaemon:
                 stack.callback(self.durable.close)
             if self.keyring is not None:
                 stack.push_async_callback(self.keyring.close)
+            stack.push_async_callback(self.revocations.close)
             if self.fabric is not None:
                 stack.push_async_callback(self.fabric.close)
             stack.callback(self._cancel_flush)
@@ -590,6 +615,20 @@ class RelayDaemon:
 
     def peer_down(self, peer: ClientName, reason: str) -> None:
         _log.warning("not connected to the relay %s: %s", peer.removeprefix(PEER_SIGN), reason)
+
+    def went_over(self, client: ClientName, peer: ClientName, *, came: bool) -> None:
+        self._comings.went_over(client, peer.removeprefix(PEER_SIGN), came=came)
+
+    def revoked(self, peer: ClientName, revocations: Sequence[KeyRevocation]) -> None:
+        self.revocations.told(peer, revocations)
+
+    def rules_compared(self, peer: ClientName, *, same: bool) -> None:
+        relay = peer.removeprefix(PEER_SIGN)
+        if same:
+            self.events.say(_log, logging.INFO, RULES, relay, "the relay %s has the access rules of this one", relay)
+        else:
+            words = "the relay %s has other access rules than this one: what goes between them both must grant"
+            self.events.say(_log, logging.WARNING, RULES, relay, words, relay)
 
     def client_down(self, client: ClientName, reason: str) -> None:
         self._comings.down(client, reason)

@@ -4,12 +4,15 @@ What a program publishes goes to the feed's own subscribers. Where the role says
 a stream of the relay like any client's: it owns its name, obeys lifespan and access rules, and reaches clients and the
 object registry. Its name is taken with the first message and given back after `IDLE_S` of silence, as a publisher of
 plain ZeroMQ does not say that it has gone.
+
+Topics of the clients of other relays are known by their objects. Those that a subscriber wants, and its role may see,
+are asked for by name, or, where they are very many, by the roles' patterns.
 """
 
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -28,6 +31,9 @@ from sern_runtime.feed import Feed, FeedHeader
 IDLE_S: Final = 30.0
 INTEREST_STREAMS: Final = 200
 """Streams whose origins are told in one go what the feed wants now; about 2 ms."""
+MOST_FAR: Final = 256
+"""Topics of other relays that are asked for by name. Where more are wanted, all are asked for that the roles may see:
+those that nobody wants are announced then, and not sent."""
 INTEREST_REST_S: Final = 0.004
 """Between two such goes: the others in the loop get their turn."""
 MAX_TOLD: Final = 1024
@@ -90,6 +96,11 @@ class RelayFeed:
         self._untold: list[StreamId] = []  # whose origins have yet to hear of what the feed wants
         self._going_on: asyncio.TimerHandle | None = None
         self._again = False  # it has changed since then
+        self._far = hub.exchange.peers.far
+        self._far.on_topic = self._far_topic
+        self._far_wanted: set[TopicName] = set()  # topics of clients of other relays
+        self._unlooked: dict[TopicName, None] = {}  # of those, to be looked at
+        hub.peers.also = self._far_asked
         self.counters: dict[str, InjectCounters] = {role.name: InjectCounters() for role in roles}
         hub.local_owners.update(role.owner for role in roles if role.ingest_endpoint is not None)
         self.feed = Feed(ctx, roles, on_publish=self._published, on_interest=self._interest, accept=self._may_own)
@@ -100,6 +111,8 @@ class RelayFeed:
             self._going_on.cancel()
             self._going_on = None
         self._hub.streams.tap = lambda _stream: False
+        self._hub.peers.also = tuple
+        self._far.on_topic = lambda _topic: None
         self.feed.close()
 
     def open_missing(self) -> bool:
@@ -177,15 +190,33 @@ class RelayFeed:
             self._again = True
             return
         self._untold = list(self._hub.relayed)
+        self._unlooked = dict.fromkeys(self._far.topics)
         self._tell_origins()
+
+    def _far_asked(self) -> Collection[str]:
+        if len(self._far_wanted) <= MOST_FAR:
+            return self._far_wanted
+        return {pattern.pattern for role in self._roles for pattern in role.subscribe}
+
+    def _far_topic(self, topic: TopicName) -> None:
+        """A topic of other relays has come or gone."""
+        self._unlooked[topic] = None
+        if self._going_on is None:
+            self._going_on = asyncio.get_running_loop().call_later(INTEREST_REST_S, self._tell_origins)
 
     def _tell_origins(self) -> None:
         told = [self._untold.pop() for _ in range(min(INTEREST_STREAMS, len(self._untold)))]
-        if not self._untold and self._again:
-            self._again = False
+        for _ in range(min(INTEREST_STREAMS, len(self._unlooked))):
+            name, _ = self._unlooked.popitem()
+            wanted = name in self._far.topics and self.feed.wants(name)
+            (self._far_wanted.add if wanted else self._far_wanted.discard)(name)
+        more = bool(self._untold or self._unlooked)
+        if not more and self._again:
+            self._again, more = False, True
             self._untold = list(self._hub.relayed)
+            self._unlooked = dict.fromkeys(self._far.topics)
         loop = asyncio.get_running_loop()
-        self._going_on = loop.call_later(INTEREST_REST_S, self._tell_origins) if self._untold else None
+        self._going_on = loop.call_later(INTEREST_REST_S, self._tell_origins) if more else None
         self._hub.streams.refresh_interest(told, now=self._clock())
         self._after()
 

@@ -11,7 +11,7 @@ import asyncio
 import logging
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -53,7 +53,8 @@ class OwnKeys:
 class RelayKeyring:
     """`session_key(client)`: the key with which the client's session is held, None if that is not known.
 
-    `overlap_s` None: keys of clients are not taken. `after` is called when there is something to send.
+    `overlap_s` None: keys of clients are not taken. `after` is called when there is something to send. `relays` says of
+    each other relay whether it is reached.
     """
 
     def __init__(
@@ -65,6 +66,7 @@ class RelayKeyring:
         overlap_s: float | None,
         session_key: Callable[[ClientName], str | None],
         after: Callable[[], None],
+        relays: Callable[[], Mapping[ClientName, bool]] = dict,
     ) -> None:
         self.own = own
         self.overlap_s = overlap_s
@@ -76,6 +78,7 @@ class RelayKeyring:
         self._admission = admission
         self._session_key = session_key
         self._after = after
+        self._relays = relays
         self._asked: set[ClientName] = set()
         self._known: dict[ClientName, ClientKeys] = {}
         self._offers: dict[ClientName, str] = {}
@@ -186,6 +189,7 @@ class RelayKeyring:
                 "in_use": fingerprint(self.own.now.public_key),
                 "next": None if self.own.next is None else fingerprint(self.own.next.public_key),
             },
+            "relays": dict(self._relays()),
             "clients": {name: self._client(name, valid.get(name, frozenset())) for name in sorted(names)},
         }
 

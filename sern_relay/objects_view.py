@@ -13,6 +13,9 @@ The text of a definition is there once, however many objects have it: `definitio
 to texts. The answer is made piece by piece, a few of them in a turn of the loop: what changes meanwhile is told as it
 is then, and again after `version`. Above 64 MiB it is refused with 400.
 
+Objects of clients of other relays are there, too. Their values are where a client here subscribes to them, or where
+somebody has asked for their kind or topic in the last ten seconds; so the first answer may lack them.
+
 Large values that came encoded are decoded, and large values hashed, in another thread before the answer. Of one that
 came while that was done the answer has the size alone.
 """
@@ -78,6 +81,8 @@ def objects_view(hub: Hub) -> JsonQuery:
 
     def read(query: Mapping[str, str]) -> JsonParts:
         wanted = selected(query)
+        if wanted.values:
+            hub.exchange.peers.look(wanted.kind or "", wanted.topic or "", now=clock.now())
         if "since" not in query:
             if "epoch" in query:
                 raise UsageError("epoch has no use without since")
@@ -120,6 +125,8 @@ def _pieces(hub: Hub, head: dict[str, Any], ids: Iterable[str], wanted: _Wanted)
             # The hub has the text once for all streams of a type.
             key = relayed.stream.stream.definition_hash
             text = hub.definitions.get(key)
+        else:
+            text, key = hub.exchange.peers.far.text(object_id)
         if key and key not in keys:
             keys[key] = text_hash(text)
             own.setdefault(text, key)

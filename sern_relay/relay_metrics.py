@@ -6,9 +6,11 @@ from typing import Protocol
 from sern_core.bodies.codecs import Coder
 from sern_core.relay.hub import Hub
 from sern_relay.durable import DurableHolding
+from sern_relay.fabric_metrics import Relays, register_relays
 from sern_relay.feed import RelayFeed
 from sern_relay.keyring import RelayKeyring
 from sern_relay.readers import Readers
+from sern_relay.revocations import FabricRevocations
 from sern_relay.server import RelayServer
 from sern_relay.transforms import TransformObjects
 from sern_relay.udp import RelayLanes
@@ -43,6 +45,7 @@ class Counting(Protocol):
     readers: Readers
     reloads: ReloadState
     durable: DurableHolding | None
+    revocations: FabricRevocations
 
     @property
     def refusals(self) -> Mapping[str, int]:
@@ -51,6 +54,14 @@ class Counting(Protocol):
     @property
     def fabric_counters(self) -> FabricCounters | None:
         """The counters of the port to other relays; None: it is not there yet."""
+
+    @property
+    def relays(self) -> Relays | None:
+        """Other relays; None: there is no fabric, or not yet."""
+
+    @property
+    def takeovers(self) -> int:
+        """Sessions that another process took under its client's name."""
 
     def clients_up(self) -> int:
         """Clients with a session."""
@@ -69,10 +80,13 @@ def register_relay(metrics: Metrics, relay: Counting, *, fabric: bool = False) -
     relay.parts.register(metrics)
     if fabric:
         register_fabric(metrics, lambda: relay.fabric_counters)
+        register_relays(metrics, lambda: relay.relays, relay.revocations, lambda: hub.revocations.left_out)
     if relay.adaptation is not None:
         relay.adaptation.register(metrics)
     metrics.gauge("sern_relay_clients", "Clients with a session.",
                   read=lambda: [((), float(relay.clients_up()))])  # fmt: skip
+    metrics.counter("sern_relay_takeovers_total", "Sessions that another process took under its client's name.",
+                    read=lambda: [((), float(relay.takeovers))])  # fmt: skip
     metrics.gauge("sern_relay_streams", "Streams announced by clients.",
                   read=lambda: [((), float(len(hub.relayed)))])  # fmt: skip
     metrics.gauge("sern_relay_objects", "Cross-reality objects in the registry.",
@@ -82,7 +96,7 @@ def register_relay(metrics: Metrics, relay: Counting, *, fabric: bool = False) -
     metrics.gauge("sern_object_feeds", "Clients that subscribe to objects.",
                   read=lambda: [((), float(len(hub.exchange.feeds)))])  # fmt: skip
     metrics.gauge("sern_objects_untold", "Objects that subscribers were not told of: their texts fit into no message.",
-                  read=lambda: [((), float(sum(feed.untold for feed in hub.exchange.feeds.values())))])  # fmt: skip
+                  read=lambda: [((), float(sum(feed.untold for feed in hub.exchange.every_feed())))])  # fmt: skip
     metrics.counter("sern_relay_refusals_total", "Announcements, subscriptions and objects refused, by code.",
                     ("code",), lambda: [((code,), float(n)) for code, n in relay.refusals.items()])  # fmt: skip
     metrics.counter("sern_bad_frames_total", "Frames that were not valid; their connections were closed.",

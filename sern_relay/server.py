@@ -85,6 +85,8 @@ class RelayServer:
         self._key_status = key_status
         self._marks = marks or Marks()
         self._insecure = keys is None
+        self._over: set[ClientConnection] = set()
+        self._burying = False  # connections that are over are still to be seen to
         self._listen = listen
         self._to_bind: tuple[str, ...] = ()
         self._after = after
@@ -192,7 +194,7 @@ class RelayServer:
         def send(datagram: bytes) -> SendResult:
             return self.socket.send_to(routing_id, datagram)
 
-        connection.served = Served(port, Pump(port, send, on_gone=lambda: self._gone(connection)))
+        connection.served = Served(port, Pump(port, send, on_gone=lambda: self._ended(connection)))
         self.clients.add(connection)
         return connection
 
@@ -340,6 +342,18 @@ class RelayServer:
             connection.served.port.disconnected(now=clock.now())
             self._after()
 
+    def _ended(self, connection: ClientConnection) -> None:
+        """Nothing can be sent on it any more. What it said last is taken first: a goodbye, for example."""
+        self._over.add(connection)
+        self._connections_changed()
+
     def _connections_changed(self) -> None:
-        for connection in self.clients.lost():
+        if not self._burying:
+            self._burying = True
+            self.socket.when_empty(self._bury)
+
+    def _bury(self) -> None:
+        self._burying = False
+        for connection in [*self._over, *self.clients.lost()]:
             self._gone(connection)
+        self._over.clear()

@@ -13,7 +13,7 @@ Messages only wait here; they are read at most `RATE_HZ` times a second for each
 subscribers. Of a faster stream the newest `MAX_WAITING` are read each time, up to `MAX_READ` transforms. They are read
 in slices of `SLICE_COST` with a pause between them: whatever is sent, it holds the loop for some milliseconds at a time
 and takes a fraction of it in all. What cannot be taken is counted by client and reason in `refused`, and the first of
-each is logged.
+each is logged. Streams of clients of another relay are read there, and their transforms come as that relay's objects.
 """
 
 import json
@@ -78,7 +78,10 @@ class TransformObjects:
         *,
         clock: Callable[[], float] = now,
         parts: OptionalParts | None = None,
+        elsewhere: Callable[[StreamId], bool] = lambda _stream: False,
     ) -> None:
+        """`elsewhere`: whether a stream comes from another relay."""
+        self._elsewhere = elsewhere
         self._parts = parts or OptionalParts("objects")
         self.refused: dict[tuple[ClientName, str], int] = {}
         """Counts by client and reason: undecodable, too_large, not_finite, too_many_transforms, or the registry's."""
@@ -99,7 +102,11 @@ class TransformObjects:
 
     def reads(self, stream: StreamInfo) -> bool:
         """Whether it is a stream of transforms."""
-        return plain_type(stream.info.type_name) in _STREAMS and stream.info.encoding is not Encoding.RAW
+        return (
+            plain_type(stream.info.type_name) in _STREAMS
+            and stream.info.encoding is not Encoding.RAW
+            and not self._elsewhere(stream.id)
+        )
 
     def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
         """Any message of any stream."""
@@ -108,6 +115,8 @@ class TransformObjects:
             if not self.reads(stream):
                 return
             known = self._streams[stream.id] = _Stream(stream)
+        elif self._elsewhere(stream.id):
+            return  # its client has gone to another relay
         if len(message.body) > MAX_BODY_BYTES:
             self._refuse(stream, "too_large", f"{len(message.body)} bytes; up to {MAX_BODY_BYTES} are read")
             return

@@ -9,6 +9,7 @@ from sern_core.vocabulary.types import ClientName
 from sern_relay.admission import Admission
 from sern_relay.clients_view import ClientsSource, clients_view
 from sern_relay.comings import Comings
+from sern_relay.fleet import announced, elsewhere
 from sern_relay.objects_view import objects_view
 from sern_relay.refusals import Refusals
 from sern_relay.told import RelayTold
@@ -17,7 +18,7 @@ from sern_runtime import clock
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.events import EventLog
 from sern_runtime.http_routes import JsonParts, JsonQuery, JsonSource, array, table
-from sern_runtime.topics_view import announced_summary, link_rows, link_summary, received_rows, received_summary
+from sern_runtime.topics_view import TopicView, link_rows, link_summary, received_rows, received_summary
 from sern_runtime.trace_view import trace_view
 
 TOO_LARGE: Final = "the answer is too large"
@@ -58,7 +59,7 @@ class RelayViews:
     def topics(self) -> dict[str, object]:
         """Counters by client link and topic, and of what arrived; and what is announced, whether taken or not."""
         return {
-            "announced": announced_summary(self._hub.streams.announced()),
+            "announced": announced(self._hub),
             "links": {name: link_summary(link, direction="send") for name, link in self._hub.links.items()},
             "received": received_summary(self._hub.received, now=clock.now()),
         }
@@ -71,10 +72,16 @@ class RelayViews:
         )
 
     def _topics(self) -> Iterator[str]:
-        """The same as `topics`, a row at a time: of each link and topic the counters add up."""
+        """The same as `topics`, a row at a time: of each link and topic the counters add up. Where there are other
+        relays, also the topics that stay there."""
         hub = self._hub
         yield '{"announced": '
-        yield from table(announced_summary(hub.streams.announced()).items())
+        yield from table(announced(hub).items())
+        if hub.peers.names:
+            rows: dict[str, TopicView] = {}
+            yield from ("" for _ in elsewhere(hub, rows))
+            yield ', "elsewhere": '
+            yield from table(rows.items())
         yield ', "links": {'
         comma = ""
         for client in tuple(hub.links):

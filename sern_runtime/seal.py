@@ -169,13 +169,17 @@ class SessionParameters:
 class Sealer:
     """Seals what one side of one session sends."""
 
-    __slots__ = ("_encrypt", "_id", "_limit", "_salt", "counter")
+    __slots__ = ("_encrypt", "_id", "_limit", "_room_bytes", "_salt", "counter")
 
-    def __init__(self, parameters: SessionParameters, side: Side, *, limit: int | None = None) -> None:
-        """`limit`: datagrams this key may seal, at most (and by default) its cipher's of `SEAL_LIMITS`."""
+    def __init__(
+        self, parameters: SessionParameters, side: Side, *, limit: int | None = None, room_bytes: int = ROOM_BYTES
+    ) -> None:
+        """`limit`: datagrams this key may seal, at most (and by default) its cipher's of `SEAL_LIMITS`. `room_bytes`:
+        what one of them may have inside; what is above a few kB is for ChaCha20, whose limit does not depend on it."""
         key, self._salt = _derive(parameters, side)
         self._encrypt = _aead(parameters.cipher, key).encrypt
         self._id = parameters.id
+        self._room_bytes = room_bytes
         self._limit = min(limit or SEAL_LIMITS[parameters.cipher], SEAL_LIMITS[parameters.cipher])
         self.counter = 0
         """Datagrams sealed so far, and the counter of the newest."""
@@ -190,9 +194,9 @@ class Sealer:
         return self.counter >= self._limit
 
     def seal(self, data: bytes) -> bytes:
-        """The datagram for `data`, of at most ROOM_BYTES. Raises RekeyError once the key is used up."""
-        if len(data) > ROOM_BYTES:
-            raise UsageError(f"{len(data)} bytes do not fit a datagram: at most {ROOM_BYTES}")
+        """The datagram for `data`, of at most `room_bytes`. Raises RekeyError once the key is used up."""
+        if len(data) > self._room_bytes:
+            raise UsageError(f"{len(data)} bytes do not fit a datagram: at most {self._room_bytes}")
         counter = self.counter + 1
         if counter > self._limit:
             raise RekeyError(f"the key of UDP session {self._id:#010x} has sealed {self._limit} datagrams; rekey")

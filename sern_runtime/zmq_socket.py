@@ -34,6 +34,8 @@ from sern_runtime.inflow import trim_memory
 
 BATCH: Final = 200
 """Messages taken in one callback, about 0.3 ms: others in the loop get their turn."""
+LAST_WORDS_DRAINS: Final = 64
+"""After so many looks at a socket that never is empty, what was to be told when it is (`when_empty`) is told anyway."""
 SKIP_FRAMES: Final = 2000
 """Frames of an unwanted message that are dropped in one callback, about 1 ms."""
 TICK_S: Final = 0.2
@@ -118,6 +120,7 @@ class DrainedSocket(ABC):
         self._scheduled: asyncio.Handle | None = None
         self._blocked = False
         self._closed = False
+        self._when_empty: list[tuple[Callable[[], None], int]] = []  # and by which drain at the latest
         self.skipping = False
         """Inside a message that is not wanted: `_take` returns True meanwhile."""
         self._fd = int(socket.FD)
@@ -129,6 +132,12 @@ class DrainedSocket(ABC):
         """Look at the socket again soon. Needed after using `socket` directly."""
         if self._scheduled is None and not self._closed:
             self._scheduled = self._loop.call_soon(self._drain_rest)
+
+    def when_empty(self, tell: Callable[[], None]) -> None:
+        """Call `tell` once all is taken that has arrived by now, or after `LAST_WORDS_DRAINS` looks where more and more
+        comes. A monitor says that a connection is over while its last messages wait here still."""
+        self._when_empty.append((tell, self.drains + LAST_WORDS_DRAINS))
+        self.kick()
 
     def send(self, body: bytes) -> SendResult:
         """Send one frame without waiting."""
@@ -214,6 +223,14 @@ class DrainedSocket(ABC):
         if self._blocked and not self._closed and self.on_writable is not None:
             self._blocked = False
             self.on_writable()
+        if self._when_empty and not self._closed:
+            self._tell_empty(now=not more)
+
+    def _tell_empty(self, *, now: bool) -> None:
+        due = [tell for tell, drains in self._when_empty if now or self.drains >= drains]
+        self._when_empty = [] if now else [each for each in self._when_empty if self.drains < each[1]]
+        for tell in due:
+            tell()
 
     @abstractmethod
     def _take(self, count: int) -> bool:

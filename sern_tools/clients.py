@@ -182,6 +182,8 @@ def clients(
 ) -> None:
     """List the clients of a relay: address, lane, since when, last heard; and who was refused, and why.
 
+    Clients of other relays are listed with the relay that they are at.
+
     At a client: the relay, and whoever's topics it takes. `since` and `heard` are how long ago.
 
     Exit code 0 when listed (or ended by Ctrl-C), 1 when there is no daemon, 2 for wrong usage.

@@ -29,7 +29,7 @@ from rich.console import Console
 from sern_core.vocabulary.errors import ConfigError, SernError
 from sern_runtime.config.endpoints import installing
 from sern_runtime.profiles import load_profile
-from sern_tools import demo_charts, demo_report, demo_view
+from sern_tools import demo_charts, demo_relays, demo_report, demo_view
 from sern_tools.counters import Counters, read_counters
 from sern_tools.demo_behaviour import Behaviour, Look
 from sern_tools.demo_link import LinkProcess
@@ -423,15 +423,28 @@ def demo(
     html: Annotated[Path | None, typer.Option(help="The report; default OUT/report.html.")] = None,
     picture: Annotated[Path | None, typer.Option(help="The age of the newest pose over time, as a PNG file.")] = None,
     view: Annotated[str | None, typer.Option(help="Keep it running for a viewer of this kind: foxglove.")] = None,
+    relays: Annotated[
+        int | None, typer.Option(min=2, max=5, help="In place of all that: so many relays, of which one is killed.")
+    ] = None,
     no_baseline: Annotated[bool, typer.Option("--no-baseline", help="Leave out the run over plain ZMQ.")] = False,
     keep: Annotated[bool, typer.Option("--keep", help="Keep configuration, keys and logs in OUT.")] = False,
 ) -> None:
     """Relay, robot and site over a bad link on this machine, beside the same load on plain ZMQ.
 
+    With --relays several relays that form a fabric (extra zenoh), of which one is killed in the middle of the run.
     Exit status: 0 every promise kept, 1 one was broken, 2 it could not run, 130 interrupted.
     """
     console = Console()
+    command = shlex.join(["sern", *sys.argv[1:]])
     try:
+        if relays is not None:
+            unused = {"--view": view, "--bag": bag, "--picture": picture, "--html": html, "--profiles": profiles}
+            for option, value in unused.items():
+                if value is not None:
+                    raise ConfigError(f"{option} does not go with --relays; leave one of them out")
+            duration_s = duration or demo_relays.DURATION_S
+            asked = demo_relays.RelaysOptions(relays, duration_s, seed, out, json or out / "result.json", keep, command)
+            raise typer.Exit(EXIT_OK if asyncio.run(demo_relays.run(asked, console)) else EXIT_BROKEN)
         link = load_profile(profile, profiles)
         if bag is not None and not bag.exists():
             raise ConfigError("no such file or directory", file=str(bag))
@@ -449,7 +462,7 @@ def demo(
             baseline=not no_baseline,
             keep=keep,
             profiles=profiles,
-            command=shlex.join(["sern", *sys.argv[1:]]),
+            command=command,
             relay_command=program("sern-relay"),
             client_command=program("sern-client"),
         )

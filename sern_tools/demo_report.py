@@ -74,11 +74,13 @@ def as_json(report: Report) -> str:
         if result is report.results[0]:
             link |= report.behaviour.as_row()
         rows.append(link)
-    reach = [
-        {"name": v.name, "value": _number(v.value), "limit": _number(v.limit), "ok": v.ok} for v in report.verdicts
-    ]
-    document = {"benchmark": "demo", "commit": commit(), "rows": rows, "reach": reach}
+    document = {"benchmark": "demo", "commit": commit(), "rows": rows, "reach": reach(report.verdicts)}
     return json.dumps(document, indent=2, allow_nan=False) + "\n"
+
+
+def reach(verdicts: Sequence[Verdict]) -> list[dict[str, object]]:
+    """The promises, each with what was found."""
+    return [{"name": v.name, "value": _number(v.value), "limit": _number(v.limit), "ok": v.ok} for v in verdicts]
 
 
 def _metrics(statistics: Statistics) -> dict[str, float]:
@@ -132,13 +134,18 @@ def print_summary(report: Report, console: Console) -> None:
         behaved.add_row(f"{report.results[0].system}, {name}:", words)
     console.print(behaved)
     console.print()
+    print_verdicts(report.verdicts, console)
+    for remark in report.remarks:
+        console.print(remark, highlight=False, style="yellow", markup=False)
+
+
+def print_verdicts(verdicts: Sequence[Verdict], console: Console) -> None:
+    """Which promises were kept."""
     promises = Table.grid(padding=(0, 2, 0, 0))
-    for verdict in report.verdicts:
+    for verdict in verdicts:
         word = Text("kept", "green") if verdict.ok else Text("BROKEN", "bold red")
         promises.add_row(word, Text(f"{verdict.promise}: {measured(verdict)}"))
     console.print(promises)
-    for remark in report.remarks:
-        console.print(remark, highlight=False, style="yellow", markup=False)
 
 
 def _behaviour(report: Report) -> list[tuple[str, str]]:

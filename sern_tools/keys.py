@@ -220,8 +220,14 @@ def run_revoke(loaded: Loaded[RelayFile], name: str, *, at_s: float, out: Callab
         seen = view["clients"].get(client, {})
         return not seen.get("valid") and not seen.get("connected")
 
-    relay.wait(out_of_it, f"the revocation of {client}")
+    view = relay.wait(out_of_it, f"the revocation of {client}")
     out(f"the relay says that no key of {client} holds, after {time.monotonic() - began_s:.1f} s")
+    reached = view.get("relays", {})
+    told, away = ([name for name, up in reached.items() if up is state] for state in (True, False))
+    if told:
+        out(f"told to the relays that it is connected to: {', '.join(told)}")
+    if away:
+        out(f"not reached now, and told when they are: {', '.join(away)}")
 
 
 # --- rotate ---------------------------------------------------------------------------------------------------------

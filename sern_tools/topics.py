@@ -2,7 +2,8 @@
 
 In and out are the daemon's own: at a relay, in is what its clients sent it and out what its subscribers have; at a
 client, in is what came from the relay and out what the relay has. Rates come from two looks at the counters. A relay
-also lists what is announced and taken by nobody, with a mark.
+also lists what is announced and taken by nobody, with a mark. Where there are several, it lists the topics of all, and
+says at which relay the owner is.
 """
 
 import json
@@ -37,7 +38,7 @@ NOT_LOSSES: Final = frozenset({"duplicate"})
 @dataclass(slots=True)
 class Counts:
     """Counters of one topic at one time. `subscribers`: links over which it is wanted now. `untaken`: it is
-    announced at a relay, and nobody takes it."""
+    announced at a relay, and nobody takes it there. `relays`: those that its owners are at, where there are several."""
 
     priority: str
     received: int = 0
@@ -47,6 +48,7 @@ class Counts:
     queued: int = 0
     subscribers: int = 0
     untaken: bool = False
+    relays: set[str] = field(default_factory=set)
     age_s: float | None = None
     reasons: Counter[str] = field(default_factory=Counter)
 
@@ -62,12 +64,13 @@ class Identity:
 @dataclass(frozen=True, slots=True)
 class Row:
     """One line of the table, and one element of `--json`: a rate beside each total. `age_s` of the freshest sample at
-    this daemon."""
+    this daemon. `relay`: that of the owner, where there are several; those of several owners are joined with commas."""
 
     topic: str
     priority: str
     type_name: str | None
     owner: str | None
+    relay: str | None
     in_hz: float
     out_hz: float
     in_bytes_per_s: float
@@ -108,8 +111,13 @@ def parse_topics(answer: Mapping[str, Any]) -> dict[str, Counts]:
                 counts.subscribers += bool(row["wanted"])
             counts.reasons.update({reason: n for reason, n in row["dropped"].items() if reason not in NOT_LOSSES})
     # A topic that nobody takes stays at its origin: no counter at the relay knows it. Older relays do not list them.
-    for name, announced in answer.get("announced", {}).items() if _is_relay(answer) else ():
-        topics.setdefault(name, Counts(announced["class"])).untaken = not announced["taken"]
+    if not _is_relay(answer):
+        return topics
+    here = answer.get("announced", {})
+    for name, announced in (*here.items(), *answer.get("elsewhere", {}).items()):
+        counts = topics.setdefault(name, Counts(announced["class"]))
+        counts.relays.update(announced.get("relays", ()))
+        counts.untaken = not here.get(name, announced)["taken"]
     return topics
 
 
@@ -145,6 +153,7 @@ def compare(
                 priority=counts.priority,
                 type_name=None if identity is None else identity.type_name,
                 owner=None if identity is None else identity.owner,
+                relay=",".join(sorted(counts.relays)) or None,
                 in_hz=(counts.received - past.received) / interval_s,
                 out_hz=(counts.delivered - past.delivered) / interval_s,
                 in_bytes_per_s=(counts.received_bytes - past.received_bytes) / interval_s,
@@ -236,13 +245,15 @@ class Column(NamedTuple):
 
 
 UNTAKEN: Final = " *"
-UNTAKEN_NOTE: Final = "* announced here, and nobody takes it: it stays at its origin"
+UNTAKEN_NOTE: Final = "* nobody here takes it: it does not come to this relay"
+RELAY: Final = "relay"
 
 COLUMNS: Final = (
     Column("topic", lambda row: row.topic + UNTAKEN * row.untaken, number=False),
     Column("class", lambda row: row.priority, number=False),
     Column("type", lambda row: row.type_name or "", 150, number=False),
     Column("owner", lambda row: row.owner or "", 110, number=False),
+    Column(RELAY, lambda row: row.relay or "", 110, number=False),
     Column("in", lambda row: si(row.in_messages), 170),
     Column("in Hz", lambda row: f"{row.in_hz:.1f}" if row.in_hz else ""),
     Column("out", lambda row: si(row.out_messages), 170),
@@ -264,7 +275,8 @@ COLUMNS: Final = (
 def table(rows: list[Row], width: int = PLAIN_WIDTH) -> Table:
     """The table for a terminal of that many characters; what there is no room for is left out."""
     result = Table(box=None, pad_edge=False)
-    columns = [column for column in COLUMNS if width >= column.width]
+    several = any(row.relay for row in rows)
+    columns = [column for column in COLUMNS if width >= column.width and (several or column.label != RELAY)]
     for column in columns:
         justify: Literal["right", "left"] = "right" if column.number else "left"
         result.add_column(column.label, no_wrap=True, justify=justify)
@@ -351,7 +363,8 @@ def topics(
         float, typer.Option("--interval", min=MIN_INTERVAL_S, help="Seconds between two looks.")
     ] = 1.0,
 ) -> None:
-    """List the topics at a relay or a client: class, owner, rates, age and drops.
+    """List the topics at a relay or a client: class, owner, rates, age and drops. At one of several relays: the topics
+    of all, and which relay the owner is at.
 
     Exit code 0 when listed (or ended by Ctrl-C), 1 when there is no daemon or no topic, 2 for wrong usage.
     """

@@ -1,7 +1,7 @@
 """The data plane of one end of a hop: datagrams out, acknowledgements in, losses and time, lane by lane. Pure."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 from sern_core.link.answers import Answers
 from sern_core.link.composer import Composer
@@ -27,6 +27,9 @@ from sern_core.stream.out_message import OutMessage
 from sern_core.vocabulary.message import Message, TopicSpec
 from sern_core.vocabulary.types import PriorityClass
 from sern_core.wire import framing
+
+ASK_AGAIN_S: Final = 10.0
+"""On a stream that does not answer, a question follows another so much later."""
 
 
 class DataPlane:
@@ -107,8 +110,10 @@ class DataPlane:
                 raise
             if not datagram.items and not window_open and not lane.path.held and self._backlog:
                 lane.path.held = not lane.stalled
-        # A stream delivers what is under way, so one question at a time is enough there.
-        if not datagram.items and (lane.ping or lane.stalled) and not (lane.lossless and lane.flight.packets):
+        # A stream delivers what is under way, so one question at a time is enough there: unless whoever would answer it
+        # is not there any more.
+        asked = lane.lossless and now < lane.flight.latest_sent_s + ASK_AGAIN_S
+        if not datagram.items and (lane.ping or lane.stalled) and not asked:
             datagram.ping()
         lane.ping = False
         if lane.stalled:
@@ -135,7 +140,7 @@ class DataPlane:
             full_s = 8 * (lane.fragment_bytes + OVERHEAD_BYTES) / rate_bps
             pacer.due_s = self._sender.cadences.hold(pacer.due_s, full_s)
         lanes.wire_bytes += nbytes
-        lane.ping_due_s = now + PING_INTERVAL_S
+        lane.question_due(now, only_asked=draft.asks)
         watermarks = bool(self._taking.watermarks)
         if len(lanes.by_id) > 1:
             end.dirty = True
@@ -273,7 +278,7 @@ class DataPlane:
             self._sender.release_held_back(now)
         if now >= lane.ping_due_s:
             lane.ping = True
-            lane.ping_due_s = now + PING_INTERVAL_S
+            lane.ping_due_s = now + PING_INTERVAL_S  # unless one leaves now
         if lane.id == LANE_ZMQ and now >= self._housekeeping.due_s:
             self._housekeeping.sweep(now)
         self._end.dirty = True

@@ -34,12 +34,14 @@ class SentPing(NamedTuple):
 class Datagram:
     """Frames behind a header that is not written yet, the items that they carry, and their size with the header."""
 
-    __slots__ = ("frames", "items", "size")
+    __slots__ = ("asks", "frames", "items", "size")
 
     def __init__(self) -> None:
         self.frames: list[bytes] = []
         self.items: list[SentData | SentWatermark | SentPing] = []
         self.size = framing.HEADER_BYTES
+        self.asks = False
+        """It carries a question, and so nothing else that is acknowledged."""
 
     def watermark(self, channel_id: int, seq: int) -> None:
         self.frames.append(framing.encode_watermark(channel_id, seq))
@@ -49,6 +51,7 @@ class Datagram:
     def ping(self) -> None:
         self.frames.append(framing.PING_FRAME)
         self.items.append(SentPing())
+        self.asks = True
 
     def fragment(self, channel: OutChannel, out: OutMessage, limit: int, now: float) -> int:
         """Append one fragment of `out`; the datagram has at most `limit` bytes then. Returns by how many it grew."""

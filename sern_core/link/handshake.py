@@ -154,10 +154,8 @@ class Handshake:
 
     def send_reset(self, tag: int, now: float) -> None:
         """Tell the initiator that its session is over."""
-        if now >= self._reset_due_s:
-            self._reset_due_s = now + RESET_INTERVAL_S
-            self._out.append(framing.encode_handshake(framing.Kind.RESET, tag, microseconds(now), {}))
-            self._end.dirty = True
+        self._out.append(framing.encode_handshake(framing.Kind.RESET, tag, microseconds(now), {}))
+        self._end.dirty = True
 
     def close(self, reason: str, now: float, *, moved: bool = False) -> None:
         """End the session on purpose and tell the peer. The transport stays. `moved`: we go on at another relay."""
@@ -281,8 +279,9 @@ class Handshake:
             return
         if header.tag == end.tag and end.established:
             raise WireError(f"version {header.version} was not agreed, {end.version} was")
-        if not end.initiator and lane_id == LANE_ZMQ:
+        if not end.initiator and lane_id == LANE_ZMQ and now >= self._reset_due_s:
             # Of another session; if that one is the peer's latest, it does not know yet that it is over.
+            self._reset_due_s = now + RESET_INTERVAL_S
             self.send_reset(header.tag, now)
 
     def _said(self, header: framing.Header, data: bytes, now: float) -> None:

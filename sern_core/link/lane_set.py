@@ -18,9 +18,9 @@ TOLD_CHANGE: Final = 1.5
 
 
 class LaneSet:
-    """`lossless` and `any_size` are of the lane on which sessions begin (`Lane`). `settled` says whether the peer has
-    all that it was told; `give_back` gets what packets carried that did not arrive; `on_rate` gets the rate of the lane
-    that carries data, None: unknown, and whether it was ever full."""
+    """`lossless`, `any_size` and `leased` are of the lane on which sessions begin (`Lane`). `settled` says whether the
+    peer has all that it was told; `give_back` gets what packets carried that did not arrive; `on_rate` gets the rate of
+    the lane that carries data, None: unknown, and whether it was ever full."""
 
     def __init__(
         self,
@@ -28,6 +28,7 @@ class LaneSet:
         *,
         lossless: bool,
         any_size: bool | None = None,
+        leased: bool = False,
         paper: bool,
         settled: Callable[[], bool],
         give_back: Callable[[Lane, list[Any], float], None],
@@ -45,7 +46,7 @@ class LaneSet:
         self._choice_due_s = now
         self.clock = ClockSync()
         """The peer's clock, as the stamps of all lanes tell."""
-        self.lane = Lane(LANE_ZMQ, end.params, lossless=lossless, any_size=any_size)
+        self.lane = Lane(LANE_ZMQ, end.params, lossless=lossless, any_size=any_size, leased=leased)
         """The lane that carries data now."""
         self.by_id = {LANE_ZMQ: self.lane}
         self.priority_lane: Lane | None = None

@@ -62,8 +62,8 @@ class Link:
 
     `towards_relay`: whether the peer is a relay; None: it is if this end says HELLO, which is a client's.
     `definitions` is shared by all links of a process. `auto_confirm`: what had its turn here is delivered; a relay
-    confirms by hand, when its subscribers have. `lossless` and `any_size` say what the lane is on which the session
-    begins (`path.lanes.Lane`).
+    confirms by hand, when its subscribers have. `lossless`, `any_size` and `leased` say what the lane is on which the
+    session begins (`path.lanes.Lane`).
     """
 
     def __init__(
@@ -81,6 +81,7 @@ class Link:
         now: float,
         lossless: bool = True,
         any_size: bool | None = None,
+        leased: bool = False,
         auto_confirm: bool = True,
         towards_relay: bool | None = None,
     ) -> None:
@@ -111,6 +112,7 @@ class Link:
             end,
             lossless=lossless,
             any_size=any_size,
+            leased=leased,
             paper=sender.paper,
             settled=self._settled,
             give_back=self._give_back,
@@ -147,7 +149,7 @@ class Link:
             answered=self._answered,
         )
         composer = Composer(end, lanes, control, sender, taking, self.outgoing.control_sent, now=now)
-        housekeeping = self.housekeeping = Housekeeping(sender, taking, now=now)
+        housekeeping = self.housekeeping = Housekeeping(sender, taking, leased=leased, now=now)
         plane = self.plane = DataPlane(end, lanes, control, sender, taking, answers, composer, housekeeping)
         self.receiver = Receiver(end, lanes, control, sender, taking, plane, reassembly, owner)
         self.reading = Reading(end, lanes, self.receiver, reassembly, taking.go_on)

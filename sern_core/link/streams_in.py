@@ -19,7 +19,7 @@ from sern_core.wire.announce import Announcement
 WHY_CHARS: Final = 400
 """The most of a reason that a refusal carries."""
 MAX_REMEMBERED: Final = 1024
-"""Durable streams that have ended whose place is remembered."""
+"""Reliable streams that have ended whose place is remembered."""
 
 
 class StreamsIn:
@@ -60,7 +60,7 @@ class StreamsIn:
         self.watermarks: dict[int, int] = {}
         """Up to where a channel is delivered, where the peer is still to be told."""
         self._gone: deque[InStream] = deque()  # streams that the peer no longer has, to be retracted
-        self._had: dict[StreamId, tuple[int, int]] = {}  # durable ones that have ended: delivered, confirmed
+        self._had: dict[StreamId, tuple[int, int]] = {}  # of reliable ones that have ended: delivered, confirmed
         self._skipping: dict[InStream, None] = {}  # streams that leave messages out, and go on in a while
         self._missing: dict[StreamId, float] = {}  # not announced by a new peer, and since when
         self._fresh: deque[tuple[InStream, Message, int]] = deque()
@@ -157,7 +157,7 @@ class StreamsIn:
             self._answers.answer(stream, wanted, now=now)
 
     def _recall(self, stream: InStream) -> None:
-        """What was delivered of a durable stream stays so when it comes back: its origin may know less than we do."""
+        """What was delivered of a stream stays so when it comes back: its origin may know less than we do."""
         delivered, confirmed = self._had.get(stream.stream.id, (0, 0))
         stream.delivered = max(stream.delivered, delivered)
         stream.confirmed = max(stream.confirmed, confirmed)
@@ -219,8 +219,11 @@ class StreamsIn:
         stream.channel_id = None
 
     def _remember(self, stream: InStream) -> None:
-        """Keep where a durable stream ends, for `_recall`; the latest of them are kept."""
-        if not stream.stream.spec.durable:
+        """Keep where a durable stream ends, for `_recall`, and at a client any reliable one: its origin may be about to
+        go over to another relay, which begins where the origin knows it to be. The latest of them are kept. What a
+        latched one has held is wanted again: whoever comes late asks the publisher that ends with it."""
+        spec = stream.stream.spec
+        if not (spec.durable or (self.auto_confirm and stream.reliable and not spec.latched)):
             return
         delivered = stream.unhandled - 1 if stream.unhandled else stream.delivered
         self._had.pop(stream.stream.id, None)

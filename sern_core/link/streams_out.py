@@ -66,6 +66,8 @@ class StreamsOut:
         self._on_dropped = self._dropped  # one for all channels
         self._announcing: deque[tuple[int, OutChannel]] = deque()  # may send once that control message is on its way
         self._price = self._priced_us = 0  # of the answers that came at this time
+        self.declined: OutChannel | None = None
+        """The channel of which the peer says just now that nobody behind it wants it."""
 
     # --- our streams ----------------------------------------------------------------------------------------------
 
@@ -173,6 +175,12 @@ class StreamsOut:
                 channel.ready = True
                 self._sender.refresh(channel, self._end.now)
 
+    def rest(self, channel: OutChannel, *, now: float) -> None:
+        """Keep nothing of a stream for the peer until it says that it wants it: what it has not got is dropped."""
+        self._end.now = now
+        self._set_wanted(channel, False, DropReason.UNWANTED)
+        self._sender.refresh(channel, now)
+
     # --- gaps -----------------------------------------------------------------------------------------------------
 
     def skip(self, channel: OutChannel, first: int, *, now: float, silent: bool = False) -> None:
@@ -265,7 +273,9 @@ class StreamsOut:
     def _answer_came(self, channel: OutChannel, want: Want, now: float) -> None:
         if want.on and channel.wanted is False and channel.reliable:
             self._control.send({"t": "first", "ch": channel.channel_id, "seq": channel.first_seq}, now=now)
+        self.declined = None if want.on else channel
         self._set_wanted(channel, want.on, DropReason.UNWANTED)
+        self.declined = None
         channel.ready = True
         self._sender.refresh(channel, now)
         self._events.wanted(channel, now=now)

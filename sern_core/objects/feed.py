@@ -5,7 +5,7 @@ is then. So a link that was gone for an hour brings only what is new, and a thin
 as often as it can.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from typing import Final, NamedTuple
 
 from sern_core.link.link import Link
@@ -40,7 +40,7 @@ OLD_S: Final = 0.15
 MOST_UNREAD_BYTES: Final = 256 * 2**10
 """What the reader may not have confirmed."""
 LOOKS: Final = 256
-"""Objects that are looked at in one turn."""
+"""Objects that are told in one turn."""
 OVERHEAD_BYTES: Final = 40
 """What a message costs beside its body."""
 
@@ -67,7 +67,7 @@ class _Told(NamedTuple):
 class ObjectFeed:
     """`sees`, `kinds` and `wants_value` say what it is about; to change them, set them and call `restart`. `text_of`
     gives the text of an object's definition, empty where there is none. `untold` counts objects whose texts fit into no
-    message."""
+    message. `passes`: how many are looked at in one turn, also where there is nothing to tell of them."""
 
     def __init__(
         self,
@@ -80,6 +80,7 @@ class ObjectFeed:
         kinds: Collection[ObjectKind] | None = None,
         wants_value: WantsValue | None = _always,
         first: int = 1,
+        passes: int = LOOKS,
     ) -> None:
         self._registry = registry
         self._link = link
@@ -87,11 +88,13 @@ class ObjectFeed:
         self.kinds = kinds
         self.wants_value = wants_value
         self._text_of = text_of
+        self._passes = passes
         self.channel = link.outgoing.open(object_stream(link.end.name, link.end.boot), first=first, now=now)
         self.untold = 0
         self.idle = False
         """Nobody is to be told anything."""
         self._pending: dict[str, None] = {}
+        self._again: set[str] = set()  # of those: also where nothing has changed that the reader is told of
         self._told: dict[str, _Told] = {}
         self._texts: set[str] = set()  # hashes of the texts that it has
         self._version = 0  # up to which `_pending` is what has changed
@@ -110,6 +113,7 @@ class ObjectFeed:
         self._began = False
         self._unsure = not whole
         self._told.clear()
+        self._again.clear()
         self._texts.clear()
         self._open = True
         self._pending = dict.fromkeys(changes.in_order)
@@ -118,6 +122,18 @@ class ObjectFeed:
     def dropped(self) -> None:
         """Something of what was told will not arrive: tell all anew."""
         self.restart()
+
+    def look_again(self, object_ids: Iterable[str]) -> None:
+        """Whether the reader may have these objects, or wants their values, may be another matter now. What it has of
+        all others stays."""
+        again = dict.fromkeys(object_ids)
+        self._again.update(again)
+        self._pending |= again
+        self._open = self._open or bool(again)
+
+    def revalue(self) -> None:
+        """The reader wants the values of other objects than before: `wants_value`."""
+        self.look_again(self._registry.named())
 
     def pump(self, *, now: float) -> None:
         """Tell what is due. Call when something has changed, when the reader has confirmed something, and every
@@ -135,16 +151,18 @@ class ObjectFeed:
             self._full = False
             return
         self._poll(now)
-        looks = LOOKS
-        while looks and self._room():
-            looks -= 1
+        looks = passes = 0
+        while looks < LOOKS and passes < self._passes and self._room():
             if not self._began:
                 self._began = True
                 self._say(encode(Begin(self._registry.epoch, not self._unsure)), now)
             elif self._pending:
                 object_id = next(iter(self._pending))
                 del self._pending[object_id]
+                seq = channel.next_seq
                 self._tell(object_id, now)
+                looks += channel.next_seq > seq
+                passes += 1
             elif self._open:
                 self._open = False
                 self._say(encode(End(self._version)), now)
@@ -158,10 +176,23 @@ class ObjectFeed:
         """Whether the reader has confirmed everything that there was to tell."""
         return not (self._pending or self._open or self.channel.retained) and self._version == self._registry.version
 
-    def _poll(self, now: float) -> None:
+    @property
+    def at_rest(self) -> bool:
+        """Whether `pump` has nothing to do."""
+        if self.idle:
+            return True
+        return self._began and not (self.channel.queue or self._pending or self._open or self._full or self._new)
+
+    @property
+    def _new(self) -> bool:
+        """Whether something has changed that the reader may have to be told."""
         registry = self._registry
         newest = registry.described_version if self.wants_value is None else registry.version
-        if self._pending or self._open or self._version >= newest:
+        return self._version < newest
+
+    def _poll(self, now: float) -> None:
+        registry = self._registry
+        if self._pending or self._open or not self._new:
             return
         if now >= self._looked_s + REST_S:
             self._looked_s = now
@@ -177,7 +208,9 @@ class ObjectFeed:
     def _tell(self, object_id: str, now: float) -> None:
         upto = None if self._pending else self._version
         known = self._told.get(object_id)
-        if known is not None and known.bare and known.bare == self._registry.described(object_id):
+        again = object_id in self._again
+        self._again.discard(object_id)
+        if known is not None and known.bare and known.bare == self._registry.described(object_id) and not again:
             return  # it has another value, of which the reader wants none
         about = self._registry.about(object_id)
         if about is None or not self.sees(object_id, about[0]):
@@ -188,8 +221,12 @@ class ObjectFeed:
             return
         valued = self.wants_value is not None and self.wants_value(object_id, about[0])
         item = self._registry.get(object_id, valued=valued)
-        if item is None or (known is not None and known.version == item.version):
+        if item is None:
             return
+        if known is not None and valued is not bool(known.bare):  # with its value or without, as it was told
+            told = known.version == item.version if valued else known.bare == self._registry.described(object_id)
+            if told:
+                return
         text = self._text_of(item)
         put = put_of(item, text, upto=upto)
         texts = hash((put[:6], tuple(put.attributes.items())))

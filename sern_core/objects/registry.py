@@ -14,6 +14,8 @@ Theory of operation
 - A value that came encoded is decoded when somebody asks. Where that must not take long, the reader sets
   `inline_bytes`, lets other threads do what `unread` gives, and asks then; a larger one that is still as it came shows
   its size alone.
+- What another relay tells of is shown (`show`) as it was told, until it is put here. `on_deleted` is called of each
+  object that is gone: something else of that id may be shown then.
 - Topic objects are named `<topic>@<client>`; ids that end in `@<client>` are reserved for that client. Other ids
   belong to whoever puts them first.
 """
@@ -21,7 +23,8 @@ Theory of operation
 import hashlib
 import re
 from collections import OrderedDict, deque
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import replace
 from operator import attrgetter
 from types import MappingProxyType
 from typing import Final
@@ -87,6 +90,8 @@ class ObjectRegistry:
         self._values = ObjectValues(self.limits)
         self.inline_bytes: int | None = None
         """The largest value that is decoded where it is asked for; None: any."""
+        self.on_deleted: Callable[[str], None] = lambda _object_id: None
+        """Called when an object is gone; set by the owner."""
         self._version = 0
         self.described_version = 0
         """The version of the last change of more than a value."""
@@ -117,8 +122,9 @@ class ObjectRegistry:
         value: bytes | None = None,
         seq: int = 0,
         ros_stamp_ns: int | None = None,
+        teller: ClientName | None = None,
     ) -> XrObject:
-        """Create or replace an object; `value` None keeps the value that is there.
+        """Create or replace an object; `value` None keeps the value that is there. `teller`: see `show`.
 
         Raises RefusedError with code `not_owner`, `bad_id`, `too_large`, `too_many_objects` or `registry_full`, and
         then changes nothing.
@@ -152,7 +158,7 @@ class ObjectRegistry:
         entry.fixed_bytes = fixed_bytes
         definition_hash = definition_hash or text_hash(definition)
         told = kind, type_name, definition, definition_hash, fields
-        redescribed = not entry.version or told != _description(entry)
+        redescribed = not entry.version or entry.teller != teller or told != _description(entry)
         if entry.kind is not kind:
             del self._by_kind[entry.kind][object_id]
             self._by_kind[kind][object_id] = entry
@@ -166,10 +172,43 @@ class ObjectRegistry:
             entry.seq = seq
             entry.ros_stamp_ns = ros_stamp_ns
         entry.wall_ns = wall_ns
+        entry.teller = teller
         self._touch(entry, now)
         if redescribed:
             entry.described = self.described_version = entry.version
         return self._seen(entry)
+
+    def show(self, item: XrObject, *, teller: ClientName, redescribed: bool, now: float) -> None:
+        """Create or replace an object as another registry has it, of which `teller` told, with what is known of its
+        value. The text of its definition is not kept; `redescribed`: it is another one.
+
+        Raises RefusedError like `put`.
+        """
+        self.put(
+            item.id,
+            owner=item.owner,
+            kind=item.kind,
+            type_name=item.type_name,
+            definition_hash=item.definition_hash,
+            attributes=item.attributes,
+            value=item.value,
+            seq=item.seq,
+            ros_stamp_ns=item.ros_stamp_ns,
+            wall_ns=item.wall_ns,
+            now=now,
+            teller=teller,
+        )
+        entry = self._entries[item.id]
+        if item.value is None:
+            self._values.told(entry, item.value_bytes, item.value_sha256)
+            entry.seq, entry.ros_stamp_ns = item.seq, item.ros_stamp_ns
+        if redescribed:
+            entry.described = self.described_version = entry.version
+
+    def make_room(self, more_bytes: int) -> None:
+        """Raise the limit of what all objects may hold: there is one more relay that tells of objects."""
+        limits = replace(self.limits, max_total_bytes=self.limits.max_total_bytes + more_bytes)
+        self.limits = self._values.limits = limits
 
     def put_stream(self, stream: StreamInfo, *, wall_ns: int, now: float) -> XrObject:
         """Create or update the object of an announced stream; another boot of its origin starts over, at seq 0
@@ -321,6 +360,11 @@ class ObjectRegistry:
         entry = self._entries.get(object_id)
         return None if entry is None else (entry.kind, entry.owner, entry.stream)
 
+    def teller(self, object_id: str) -> ClientName | None:
+        """The peer that told of the object that is shown; None: it was put here, or there is none."""
+        entry = self._entries.get(object_id)
+        return None if entry is None else entry.teller
+
     def unread(
         self,
         *,
@@ -436,18 +480,7 @@ class ObjectRegistry:
             raise RefusedError(
                 "not_owner", f"{owner} may not put {object_id[:80]}: {entry.owner} owns it; choose another id"
             )
-        if not object_id or len(object_id) > limits.max_id_chars or not object_id.isprintable():
-            raise RefusedError(
-                "bad_id",
-                f"{owner} may not put {object_id[:80]!r}: an id has 1 to {limits.max_id_chars} printable characters",
-            )
-        reserved = _RESERVED.fullmatch(object_id)
-        if reserved is not None and reserved[1] != owner:
-            raise RefusedError(
-                "not_owner",
-                f"{owner} may not put {object_id[:80]}: ids that end in @{reserved[1]} belong to {reserved[1]}; "
-                "choose another id",
-            )
+        self.check_id(object_id, owner)
         for what, size, limit in (
             ("bytes of definition", definition_bytes, limits.max_definition_bytes),
             ("attributes", attributes, limits.max_attributes),
@@ -462,6 +495,22 @@ class ObjectRegistry:
                 "too_many_objects",
                 f"{owner} may not put {object_id[:80]}: it has {limits.max_objects_per_owner} objects, which is the "
                 "limit; delete some",
+            )
+
+    def check_id(self, object_id: str, owner: ClientName) -> None:
+        """Raises RefusedError for what is no id of an object, or one that is reserved for others."""
+        limits = self.limits
+        if not object_id or len(object_id) > limits.max_id_chars or not object_id.isprintable():
+            raise RefusedError(
+                "bad_id",
+                f"{owner} may not put {object_id[:80]!r}: an id has 1 to {limits.max_id_chars} printable characters",
+            )
+        reserved = _RESERVED.fullmatch(object_id)
+        if reserved is not None and reserved[1] != owner:
+            raise RefusedError(
+                "not_owner",
+                f"{owner} may not put {object_id[:80]}: ids that end in @{reserved[1]} belong to {reserved[1]}; "
+                "choose another id",
             )
 
     def _touch(self, entry: Entry, now: float) -> None:
@@ -486,6 +535,7 @@ class ObjectRegistry:
         if len(self._deletions) == self._deletions.maxlen:
             self._forgotten_version = self._deletions[0][0] if self._deletions else self._version
         self._deletions.append((self._version, entry.id, entry.kind))
+        self.on_deleted(entry.id)
 
     def _is_long(self, entry: Entry) -> bool:
         """Whether telling the value takes longer than it may where somebody asks."""

@@ -54,6 +54,7 @@ class Entry:
         "sha256",
         "share",
         "stream",
+        "teller",
         "type_name",
         "updated_s",
         "value_bytes",
@@ -83,6 +84,7 @@ class Entry:
         self.version = 0
         self.described = 0  # the version of the last change of more than its value
         self.stream: StreamId | None = None
+        self.teller: ClientName | None = None  # the peer that told of it; None: its owner is here
 
 
 class ObjectValues:
@@ -113,6 +115,11 @@ class ObjectValues:
         if self.held_bytes + size <= limits.max_held_bytes and own_held_bytes + size <= limits.max_held_per_owner:
             self._count_held(entry, size)
             entry.body, entry.codec = body, codec
+
+    def told(self, entry: Entry, value_bytes: int, sha256: str | None) -> None:
+        """The value is not here, and this is known of it; -1 bytes: nothing."""
+        self.forget(entry)
+        entry.value_bytes, entry.sha256 = value_bytes, sha256
 
     def count(self, entry: Entry, nbytes: int) -> None:
         """An object takes so many bytes more."""

@@ -30,6 +30,11 @@ OVERHEAD_BYTES: Final = 60
 PROVEN_ACKS: Final = 3
 """A lane that failed while another one worked is used again after so many acknowledged questions."""
 PING_INTERVAL_S: Final = 0.5
+PING_GROWTH: Final = 16
+LEASED_PING_INTERVAL_S: Final = 16.0
+"""On a leased lane the pause before a question grows by that factor up to this while nothing else goes either way."""
+IDLE_BYTES: Final = 256
+"""What has come since the last question was no more than the peer's own questions if it is no more than this."""
 PROBE_INTERVAL_S: Final = 0.1
 MAX_PROBE_INTERVAL_S: Final = 0.2
 """While stalled, one fresh class-0 message goes out this often and finds out whether the path is back: once in a round
@@ -74,7 +79,9 @@ class Path:
 
 class Lane:
     """State of one lane of one link. `lossless`: a stream (TCP) underneath. `any_size`: datagrams may be large, as over
-    a stream, lost or not (None: where nothing is lost). `beside`: the lane whose path it shares, until `leave`."""
+    a stream, lost or not (None: where nothing is lost). `leased`: it leads to another relay, and what carries it tells
+    within seconds that the peer is gone: an idle lane need not ask often, and acknowledgements are sparse. `beside`: of
+    which lane it shares the path, until `leave`."""
 
     def __init__(
         self,
@@ -83,6 +90,7 @@ class Lane:
         *,
         lossless: bool,
         any_size: bool | None = None,
+        leased: bool = False,
         beside: "Lane | None" = None,
     ) -> None:
         self.id = lane
@@ -99,7 +107,8 @@ class Lane:
         if beside is not None:
             beside.beside = self
         self.flight = Flight(lossless=lossless)
-        self.arrivals = Arrivals(lossless=lossless)
+        self.leased = leased
+        self.arrivals = Arrivals(lossless=lossless, sparse=leased)
         self.stalled = False
         self.stalled_at_s = 0.0
         """When it was last found to be."""
@@ -109,6 +118,9 @@ class Lane:
         self.answered = False  # at all, in the session
         self.ping = False
         self.ping_due_s = 0.0
+        self._ping_interval_max_s = LEASED_PING_INTERVAL_S if leased else PING_INTERVAL_S
+        self._ping_interval_s = PING_INTERVAL_S
+        self._came_bytes = 0  # by the last question
         self.loss = 0.0
         """Share of recent packets that were lost."""
         self.acked_packets = 0
@@ -216,6 +228,15 @@ class Lane:
                 return datagram
         return None
 
+    def question_due(self, now: float, *, only_asked: bool = False) -> None:
+        """A numbered datagram leaves (`only_asked`: it is a question itself), or the lane is about to ask."""
+        came_bytes = self.arrivals.cum_bytes
+        idle = only_asked and not self.stalled and came_bytes - self._came_bytes <= IDLE_BYTES
+        interval_s = PING_GROWTH * self._ping_interval_s if idle else PING_INTERVAL_S
+        self._ping_interval_s = min(interval_s, self._ping_interval_max_s)
+        self._came_bytes = came_bytes
+        self.ping_due_s = now + self._ping_interval_s
+
     @property
     def usable(self) -> bool:
         return self.up and not self.stalled
@@ -226,10 +247,12 @@ class Lane:
         self.answered = False
         self.ping = False
         self.ping_due_s = now
+        self._ping_interval_s = PING_INTERVAL_S
+        self._came_bytes = 0
         self.copies.clear()
         self.copy_rest.restart()
         self.flight = Flight(lossless=self.lossless)
-        self.arrivals = Arrivals(lossless=self.lossless)
+        self.arrivals = Arrivals(lossless=self.lossless, sparse=self.leased)
         self.acknowledged_bytes = 0
         if self.beside is None:
             self.pacer = self.path.pacer = Pacer()

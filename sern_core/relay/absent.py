@@ -7,7 +7,8 @@ from sern_core.link.link import Link
 from sern_core.relay.clients import Clients
 from sern_core.relay.hub_events import GuardedEvents
 from sern_core.relay.relayed_streams import RelayedStreams
-from sern_core.relay.routing import Denied, Match, RouteChange, RoutingTable
+from sern_core.relay.route_change import Denied, Match, RouteChange
+from sern_core.relay.routing import RoutingTable
 from sern_core.vocabulary.errors import RefusedError
 from sern_core.vocabulary.limits import PeerLimits
 from sern_core.vocabulary.message import StreamId
@@ -23,8 +24,7 @@ MAX_ABSENT_CLIENTS: Final = 1024
 
 
 class AbsentClients:
-    """`known` says whether a name is in the directory of clients, `home` which peer a client is at: that gets the
-    stream in its place, before it has asked."""
+    """`known` says whether a name is in the directory of clients."""
 
     def __init__(
         self,
@@ -34,15 +34,12 @@ class AbsentClients:
         events: GuardedEvents,
         known: Callable[[ClientName], bool],
         limits: PeerLimits,
-        *,
-        home: Callable[[ClientName], ClientName | None],
     ) -> None:
         self._clients = clients
         self._streams = streams
         self._routing = routing
         self._events = events
         self.known = known
-        self._home = home
         self._most_topics = limits.absent_topics
         self._topics: dict[ClientName, set[TopicName]] = {}
         self._subscribed: set[ClientName] = set()  # said what they want, to this run of the relay
@@ -55,6 +52,10 @@ class AbsentClients:
         self._topics.pop(client, None)
         self._subscribed.add(client)
 
+    def asked(self, client: ClientName) -> bool:
+        """Whether the client has said what it wants."""
+        return client in self._subscribed
+
     def forget(self, client: ClientName) -> None:
         """The client is given up."""
         self._topics.pop(client, None)
@@ -66,23 +67,25 @@ class AbsentClients:
         own: list[Match] = []
         others: list[Match] = []  # of the same name (many_writers)
         denied: list[Denied] = []
+        known = self._routing.info(identity) is not None
         for text in required:
             client = ClientName(text)
             # Connected is not enough: it may not have come to say what it wants yet.
             if client in self._subscribed or client == identity.origin:
+                continue
+            if known and self._streams.moves.settled(identity, client):
                 continue
             if not is_client_name(client) or not self.known(client):
                 continue
             if client not in self._clients.links and len(self._topics) >= MAX_ABSENT_CLIENTS:
                 continue
             source.reassembly.work_us += ABSENT_US
-            client = self._home(client) or client
             self._clients.link(client, now)
             topics = self._topics.setdefault(client, set())
             if len(topics) >= self._most_topics and identity.topic not in topics:
                 continue
             topics.add(identity.topic)
-            if self._routing.info(identity) is None or client in self._routing.subscribers(identity):
+            if not known or client in self._routing.subscribers(identity):
                 continue
             try:
                 change = self._routing.also(client, identity.topic)

@@ -72,7 +72,7 @@ class Clients:
         if older is not None and older is not port:
             older.link = None
             if rival:  # its connection is up: it did not end before the other began
-                older.displace(tag, port, now=now)
+                older.displace(tag, f"from {port.address}" if port.address else "", now=now)
                 self._events.refused(
                     port.client, DISPLACED, f"another process connected as {port.client} from {port.address or '?'}; "
                     f"the one from {older.address or '?'} has no session any more"
@@ -109,12 +109,19 @@ class Clients:
             link.close(reason, now=now)
             link.disconnected(now=now)
 
-    def forget(self, client: ClientName) -> None:
+    def went_over(self, client: ClientName, relay: str, *, now: float) -> None:
+        """A client that has a session here has begun another one at another relay."""
+        link, port = self.links.get(client), self.port_of.get(client)
+        if link is not None and link.established and port is not None:
+            port.displace(link.end.tag, f"at the relay {relay}", now=now)
+        self.end_session(client, f"{client} has connected to the relay {relay}", now=now)
+
+    def forget(self, client: ClientName, now: float) -> None:
         """The last step of giving a client up (`Hub.forget`): nothing of it is relayed any more."""
-        del self.links[client]
+        link = self.links.pop(client)
         port = self.port_of.pop(client, None)
         if port is not None:
-            port.link = None
+            port.forget(link.end.tag, now=now)
         self._absent_since.pop(client, None)
         self._bounds.pop(client, None)
 

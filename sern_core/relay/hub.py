@@ -25,7 +25,10 @@ from sern_core.objects.xr_object import XrObject
 from sern_core.path.lanes import LANE_PRIORITY
 from sern_core.relay.absent import AbsentClients
 from sern_core.relay.access import AccessTable
+from sern_core.relay.claims import Claims
 from sern_core.relay.clients import Clients
+from sern_core.relay.far_objects import PEER_BYTES
+from sern_core.relay.feed_owners import FeedOwners
 from sern_core.relay.forwarding import Forwarding
 from sern_core.relay.holding import Holding
 from sern_core.relay.hub_events import GuardedEvents, HubEvents, Relayed
@@ -34,17 +37,22 @@ from sern_core.relay.hub_port import HubPort
 from sern_core.relay.local_streams import LocalStreams
 from sern_core.relay.moved import MovedClients
 from sern_core.relay.object_exchange import OBJECTS_TOPIC, ObjectExchange
+from sern_core.relay.offers_again import NOT_THERE, OffersAgain
+from sern_core.relay.peer_control import PeerControl
+from sern_core.relay.peer_rules import RulesExchange
 from sern_core.relay.peers import Peers, says_hello
 from sern_core.relay.presence import Presence
 from sern_core.relay.relayed_streams import RelayedStreams
-from sern_core.relay.routing import BadPatternError, RouteChange, RoutingLimits, RoutingTable
+from sern_core.relay.revocations import Revocations
+from sern_core.relay.route_change import RouteChange
+from sern_core.relay.routing import PEER_TIMES, BadPatternError, RoutingLimits, RoutingTable
 from sern_core.relay.traces import Traces
 from sern_core.stream.in_stream import InStream
 from sern_core.stream.out_channel import OutChannel
 from sern_core.stream.out_message import OutMessage
 from sern_core.vocabulary.errors import RefusedError, WireError
 from sern_core.vocabulary.key_news import ClientKeys, RelayKeys
-from sern_core.vocabulary.message import Message, StreamId
+from sern_core.vocabulary.message import Message
 from sern_core.vocabulary.names import is_client_name, is_peer, name_problem, peer_name
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
 from sern_core.vocabulary.types import ClientName, DropReason, TopicName
@@ -116,9 +124,27 @@ class Hub:
             access, self.events, self._make_link, resume_s=params.resume_s, limits=link.limits
         )
         self.links = clients.links
-        self.peers = Peers(peer_name(name), clients, self.routing, displaced=self._displaced, changed=self._moved)
+
+        def wall_us(now: float) -> int:
+            return wall_ns(now) // 1000
+
+        self.feeds = FeedOwners(name, self.local_owners, clash=self._clash, contested=self._contested)
+        self.peers = Peers(
+            peer_name(name),
+            clients,
+            self.routing,
+            self.feeds,
+            displaced=self._displaced,
+            changed=self._moved,
+            wall_us=wall_us,
+        )
         """The other relays, where there is a fabric."""
-        self.routing.stays = self.local_owners
+        self.routing.stays = self.feeds.stay
+        self.routing.rights.home = self.peers.home
+        self.rules = RulesExchange(
+            access.rules, clients, self.routing.rights, self.events, reached=self.peers.reached, judge=self._judge
+        )
+        self.revocations = Revocations(clients, self.events, self.peers.reached)
         self.presence = Presence(
             clients.links,
             self.local_owners,
@@ -139,15 +165,24 @@ class Hub:
             ended=self._own_ended,
             limits=link.limits,
             home=self.peers.home,
-            moved=self.peers.moved,
             now=now,
         )
+        self.offers_again = OffersAgain(streams, self.peers.epoch)
         self.relayed = streams.by_id
+        self.claims = Claims(
+            clients,
+            self.routing,
+            home=self.peers.home,
+            wall_us=wall_us,
+            give_way=lambda stream, why, now: streams.refuse(stream, "name_taken", why, now),
+        )
+        streams.check, streams.changed = self.claims.check, self.claims.changed
         self.forwarding = Forwarding(name, clients, streams, self.objects, self.events)
         self.received = self.forwarding.received
         self.local = LocalStreams(
-            boot, self.local_owners, clients.links, self.routing, self._numbering, streams, self.forwarding
-        )
+            boot, self.local_owners, clients.links, self.routing, self._numbering, streams, self.forwarding,
+            owned=self._owned,
+        )  # fmt: skip
         self.exchange = ObjectExchange(
             self.objects,
             clients.links,
@@ -155,13 +190,27 @@ class Hub:
             text_of=self._text_of,
             refused=self.events.refused,
             attempt=clients.attempt,
+            home=self.peers.home,
+            via=self.routing.via,
         )
         self.holding = Holding(clients, streams, self.definitions.get)
         """Durable streams, where the shell has a place on disk for them."""
         streams.on_disk = self.holding.position
         self.forwarding.hold = self.holding.message
-        self.absent = AbsentClients(
-            clients, streams, self.routing, self.events, known, link.limits, home=self.peers.home
+        self.absent = AbsentClients(clients, streams, self.routing, self.events, known, link.limits)
+        streams.moves.asked = self.absent.asked
+        streams.moves.deserted = self.peers.deserted
+        self.from_peers = PeerControl(
+            clients,
+            streams,
+            self.events,
+            peers=self.peers,
+            claims=self.claims,
+            feeds=self.feeds,
+            rules=self.rules,
+            revocations=self.revocations,
+            presence=self.presence,
+            max_claims=params.routing.max_all_streams,
         )
         self.moved = MovedClients(clients, self.routing, streams, self.local_owners)
 
@@ -183,6 +232,7 @@ class Hub:
             now=now,
             lossless=self._lossless and not is_peer(client),
             any_size=True if is_peer(client) else None,
+            leased=is_peer(client),
             auto_confirm=False,
         )
         link.receiver.on_stray = self.received.stray
@@ -196,7 +246,7 @@ class Hub:
         about = self.objects.about(item.id)
         relayed = None if about is None or about[2] is None else self.relayed.get(about[2])
         if item.definition or relayed is None:
-            return item.definition
+            return item.definition or self.exchange.peers.far.text(item.id)[0]
         digest = relayed.stream.stream.definition_hash
         return self.definitions.get(digest) if digest in self.definitions else ""
 
@@ -222,7 +272,7 @@ class Hub:
         """Let go of clients that stay away, and of ended streams that are fully delivered. Call about once a second,
         and then `lapse`."""
         self.lapse(now=now)
-        for client in (*self.clients.gone(now), *self.moved.not_needed()):
+        for client in (*self.clients.gone(now), *self.moved.not_needed(), *self.streams.moves.not_needed()):
             if client in self.links and not self.holding.owes(client):
                 self.clients.attempt(client, now, partial(self._forget, client, now))
         self.clients.sweep_orphans(now)
@@ -247,7 +297,9 @@ class Hub:
         """Tell clients what has changed of the objects that they subscribe to, and peers what is wanted here. Call ten
         times a second."""
         self.exchange.pump(now=now)
+        self.exchange.peers.work(now=now)
         self.peers.ask(now=now)
+        self.claims.tell(now=now)
         self.after()
 
     def lapse(self, *, now: float) -> bool:
@@ -279,7 +331,7 @@ class Hub:
         self.streams.drop_client(client, reason, now)
         self.events.lane_closed(client)
         link.close_streams()
-        self.clients.forget(client)
+        self.clients.forget(client, now)
         lost = [counters for counters in link.counters.values() if counters.topic in reliable]
         self.clients.given_up.keep(client, lost, now=now)
         self.traces.forget(client)
@@ -287,10 +339,11 @@ class Hub:
         self.matching.forget(client)
         self.absent.forget(client)
         self.moved.discard(client)
-        self.objects.delete_owned(client)
         self.exchange.forget(client)
         if is_peer(client):
             self.peers.lost(client, now=now)
+            self.claims.lost(client)
+            self.rules.lost(client)
         else:
             self.peers.left(client, now=now)
 
@@ -299,19 +352,40 @@ class Hub:
     def add_peer(self, relay: ClientName, address: str = "") -> HubPort:
         """There is another relay of the fabric, which `address` leads to: the port of the hop between the two."""
         peer = peer_name(relay)
+        if peer not in self.peers.names:
+            self.objects.make_room(PEER_BYTES)
         self.peers.add(peer)
         return HubPort(self, peer, address, greets=says_hello(self.peers.own, peer))
 
+    def _owned(self, now: float) -> None:
+        """The relay is about to publish under a name of its own."""
+        self.peers.tell_feeds(now=now)
+
+    def _clash(self, peer: ClientName, text: str) -> None:
+        self.events.refused(peer, "name_taken", text)
+
+    def _contested(self, owner: ClientName, now: float) -> None:
+        """A name of the relay's own has become one that another relay has, too, or is that no more."""
+        self.streams.apply(self.routing.judge(owner), now)
+
     def _displaced(self, client: ClientName, peer: ClientName, now: float) -> None:
         """A client that has a session here has begun another one at a peer."""
-        self.clients.end_session(client, f"{client} has connected to the relay {peer[1:]}", now=now)
+        self.clients.went_over(client, peer[1:], now=now)
+        self.events.went_over(client, peer, came=False)
 
     def _moved(self, client: ClientName, now: float) -> None:
         """A client has come to a peer, or left it. What is held for it here goes there."""
         self.presence.changed(client, now=now)
         peer = self.peers.home(client)
         if peer is not None:
+            self.exchange.went(client, now=now)
             self._from_peer(client, peer, now)
+            for identity in self.routing.streams_of(client):
+                if self.routing.via(identity) is None:
+                    self.streams.relocate(identity, peer, now)
+            if self.routing.rights.saw(peer, client):
+                self.routing.peer_has(peer)
+                self.matching.look(peer, now=now)
         if peer is not None and client in self.links:
             self.absent.forget(client)
             self.matching.forget(client)
@@ -333,11 +407,18 @@ class Hub:
             else:
                 self.streams.answer(relayed, now)
 
+    def _judge(self, peer: ClientName, now: float) -> None:
+        """What the rules of a peer grant has changed."""
+        self.streams.rejudge(peer, now)
+        for client in self.links:
+            self.matching.look(client, now=now)
+
     def revoke(self, access: AccessTable, *, now: float) -> None:
         """New access rules: what they no longer allow ends now."""
         self.clients.limit(access, now)
         self.streams.revoke(access, now)
         self.exchange.revoke()
+        self.rules.use(access.rules, now=now)
         for client in self.links:
             self.matching.look(client, now=now)
 
@@ -383,12 +464,23 @@ class Hub:
     def on_up(self, link: Link, *, resumed: bool, now: float) -> None:
         self.clients.came(link.peer)
         if is_peer(link.peer):
+            self.rules.up(link, now=now)  # before anything is announced
+            self.streams.moves.up(link.peer)
             self.peers.up(link, now=now)
+            self.claims.up(link, now=now)
+            self.revocations.up(link, now=now)
+            self.exchange.came(link, resumed=resumed, now=now)
             if not resumed:
                 self.streams.prime(link, now)
+            self.presence.relay_changed(link.peer, now=now)
             self.events.peer_up(link.peer)
             return
+        before = self.peers.home(link.peer)
         self.peers.came(link.peer, now=now)
+        self.streams.moves.came_home(link.peer, now)
+        self.offers_again.came(self.routing.streams_of(link.peer), now=now)
+        if before is not None:
+            self.events.went_over(link.peer, before, came=True)
         self.moved.discard(link.peer)
         if link.end.peer_boot is not None:
             self.routing.returned(link.peer, link.end.peer_boot)
@@ -402,6 +494,7 @@ class Hub:
     def on_down(self, link: Link, reason: str, *, now: float) -> None:
         self.clients.went(link.peer, now)
         if is_peer(link.peer):
+            self.presence.relay_changed(link.peer, now=now)
             self.events.peer_down(link.peer, reason)
             return
         self.presence.changed(link.peer, now=now)
@@ -418,7 +511,7 @@ class Hub:
     def on_announce(self, link: Link, announcement: Announcement, *, now: float) -> bool | None:
         stream = link.taking.streams[announcement.stream.id]
         identity = stream.stream.id
-        if is_peer(link.peer):
+        if is_peer(link.peer) and identity.topic != OBJECTS_TOPIC:
             if self.peers.home(identity.origin) != link.peer:
                 raise RefusedError(
                     "origin", f"{link.peer[1:]} announced a stream of {identity.origin}, who is not there"
@@ -435,12 +528,17 @@ class Hub:
             relayed = self.streams.take(link, stream, now)
         except RefusedError as refusal:
             self.events.refused(link.peer, refusal.code, str(refusal))
+            if refusal.code == "name_taken" and is_peer(link.peer):
+                self.claims.refused(identity, link.peer)
             raise
         if stream.reliable:
             relayed.source = None  # one answer for all who are absent
+            moves = self.streams.moves
+            moves.named_by_source = frozenset(map(ClientName, announcement.required))
             self.absent.hold(announcement.required, identity, link, now)
+            moves.named_by_source = frozenset()
         relayed.source = link
-        self.streams.moves.came_again(relayed)
+        self.streams.moves.came(relayed, now=now)
         self.streams.answer(relayed, now)
         return None
 
@@ -449,7 +547,7 @@ class Hub:
         relayed = self.relayed.get(identity)
         if relayed is not None and relayed.source is not link and (is_peer(link.peer) or self.routing.via(identity)):
             return  # it comes from elsewhere by now
-        if is_peer(link.peer) and not self.streams.moves.ends_for_good(identity):
+        if is_peer(link.peer) and not self.streams.moves.ends_for_good(identity, link.peer, now=now):
             return
         if identity.topic != OBJECTS_TOPIC:
             self.streams.retract(link, stream, now)
@@ -483,6 +581,8 @@ class Hub:
 
     def on_refused(self, link: Link, channel: OutChannel, code: str, text: str, *, now: float) -> None:
         self.events.refused(link.peer, code, text)
+        if code == NOT_THERE and is_peer(link.peer):
+            self.offers_again.refused(link.peer, channel, now=now)
 
     def on_skipped(self, link: Link, stream: InStream, count: int, *, now: float) -> None:
         """Messages of the origin that were given up before they got here: subscribers go on behind them."""
@@ -498,9 +598,6 @@ class Hub:
         if is_peer(link.peer):
             self.streams.refresh_interest([channel.stream.id], now=now)
             self.streams.moves.named(link, channel, now=now)
-            asking = self.peers.answered(link, channel)
-            if asking is not None:
-                self.matching.ask(link.peer, asking, now=now)
 
     def on_definition(self, link: Link, digest: str, *, now: float) -> None:
         link.reassembly.work_us += len(self.links) + len(self.relayed) // STREAMS_PER_US
@@ -512,18 +609,12 @@ class Hub:
 
     def on_control(self, link: Link, envelope: framing.Envelope, attachment: bytes, *, now: float) -> None:
         kind = envelope["t"]
-        if is_peer(link.peer):
-            self._on_peer_control(link, kind, envelope, now)
-        elif kind == "subscribe":
+        if kind == "subscribe":
             self._subscribe(link.peer, envelope, now)
         elif kind == "objects":
-            try:
-                self.exchange.subscribe(link, envelope, now=now)
-            except RefusedError as refusal:
-                self.events.refused(link.peer, refusal.code, str(refusal))
-                self.clients.tell(
-                    link.peer, {"t": "denied", "pattern": "", "code": refusal.code, "why": str(refusal)[:400]}, now
-                )
+            self._subscribe_objects(link, envelope, now)
+        elif is_peer(link.peer):
+            self.from_peers.message(link, kind, envelope, attachment, now)
         elif kind == "key":
             link.reassembly.work_us += KEYS_US
             told = ClientKeys(
@@ -538,29 +629,14 @@ class Hub:
         else:
             raise WireError(f"unknown control message {kind!r}")
 
-    def _on_peer_control(self, link: Link, kind: str, envelope: framing.Envelope, now: float) -> None:
-        if kind == "subscribe":
-            self._subscribe(link.peer, envelope, now)
-        elif kind == "here":
-            self.peers.told(link.peer, envelope, now=now)
-        elif kind == "left":
-            self.peers.told_left(link.peer, envelope, now=now)
-        elif kind == "again":
-            origin, boot = framing.take_str(envelope, "origin", max_length=64), framing.take_int(envelope, "boot")
-            topic = framing.take_str(envelope, "topic")
-            self.streams.moves.expect_again(StreamId(ClientName(origin), boot, TopicName(topic)))
-        elif kind in ("go", "released"):
-            client = ClientName(framing.take_str(envelope, "client", max_length=64))
-            topic = framing.take_str(envelope, "topic")
-            if kind == "go":
-                self.streams.moves.go(client, TopicName(topic), now=now)
-            elif self.peers.home(client) is not None and client in self.links:
-                self.streams.moves.released(client, TopicName(topic), now=now)
-        elif kind == "denied":
-            code = framing.take_str(envelope, "code", max_length=64)
-            self.events.refused(link.peer, code, framing.take_str(envelope, "why"))
-        else:
-            raise WireError(f"unknown control message {kind!r}")
+    def _subscribe_objects(self, link: Link, envelope: framing.Envelope, now: float) -> None:
+        try:
+            self.exchange.subscribe(link, envelope, now=now)
+        except RefusedError as refusal:
+            self.events.refused(link.peer, refusal.code, str(refusal))
+            self.clients.tell(
+                link.peer, {"t": "denied", "pattern": "", "code": refusal.code, "why": str(refusal)[:400]}, now
+            )
 
     def _subscribe(self, client: ClientName, envelope: framing.Envelope, now: float) -> None:
         parts = self._subscriptions.setdefault(client, [])
@@ -569,10 +645,9 @@ class Hub:
             known = framing.take_strings(envelope, "known", max_length=64)
             self.presence.ask(client, map(ClientName, filter(is_client_name, known)))
         if framing.take_bool(envelope, "more"):
-            if len(parts) > MAX_SUBSCRIPTION_PARTS * framing.MAX_ENVELOPE_ITEMS:
-                raise WireError(
-                    f"more than {MAX_SUBSCRIPTION_PARTS * framing.MAX_ENVELOPE_ITEMS} subscription patterns"
-                )
+            most = MAX_SUBSCRIPTION_PARTS * framing.MAX_ENVELOPE_ITEMS * (PEER_TIMES if is_peer(client) else 1)
+            if len(parts) > most:
+                raise WireError(f"more than {most} subscription patterns")
             return
         self.matching.ask(client, self._subscriptions.pop(client), now=now)
         if framing.take_bool(envelope, "peers"):
@@ -585,8 +660,6 @@ class Hub:
         # What is a name and no pattern is denied by name: that gives nothing away about what there is.
         names = {TopicName(part) for part in parts if name_problem(part) is None}
         patterns = [part for part in parts if part not in names]
-        if is_peer(client):
-            names |= self.peers.asks(client, parts)
         try:
             self.streams.apply(self.routing.subscribe(client, patterns, exact=names), now)
             if self.streams.draining.has(client):
@@ -646,5 +719,8 @@ class Hub:
                 assert id(channel) in held_channels, f"{channel.stream.id.topic}: nobody's channel to {client}"
         self.absent.validate(self.links)
         self.peers.validate()
+        self.claims.validate()
+        self.revocations.validate()
+        self.feeds.validate()
         self.streams.moves.validate()
         self.moved.validate()

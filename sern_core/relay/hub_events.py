@@ -1,6 +1,6 @@
 """What the relay's core tells its shell, and what it keeps of each stream."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import ParamSpec, Protocol
 
@@ -8,7 +8,7 @@ from sern_core.link.link import Link
 from sern_core.stream.in_stream import InStream
 from sern_core.stream.latched import MAX_REPLAY_MESSAGES, LatchedCache, ReplayStore
 from sern_core.stream.out_channel import OutChannel
-from sern_core.vocabulary.key_news import ClientKeys
+from sern_core.vocabulary.key_news import ClientKeys, KeyRevocation
 from sern_core.vocabulary.message import Message, StreamInfo
 from sern_core.vocabulary.names import is_peer
 from sern_core.vocabulary.types import ClientName
@@ -26,6 +26,15 @@ class HubEvents(Protocol):
 
     def peer_down(self, peer: ClientName, reason: str) -> None:
         """It has ended."""
+
+    def went_over(self, client: ClientName, peer: ClientName, *, came: bool) -> None:
+        """A client has begun a session here after one at that peer (`came`), or there after one here."""
+
+    def revoked(self, peer: ClientName, revocations: Sequence[KeyRevocation]) -> None:
+        """A peer tells of keys that are to let nobody in any more: have it so, and remember them."""
+
+    def rules_compared(self, peer: ClientName, *, same: bool) -> None:
+        """Whether a peer has the access rules of this relay, told when that changes."""
 
     def stream_added(self, stream: StreamInfo) -> None: ...
 
@@ -86,6 +95,15 @@ class GuardedEvents:
     def peer_down(self, peer: ClientName, reason: str) -> None:
         self._tell(self.shell.peer_down, peer, reason)
 
+    def went_over(self, client: ClientName, peer: ClientName, *, came: bool) -> None:
+        self._tell(self.shell.went_over, client, peer, came=came)
+
+    def revoked(self, peer: ClientName, revocations: Sequence[KeyRevocation]) -> None:
+        self._tell(self.shell.revoked, peer, revocations)
+
+    def rules_compared(self, peer: ClientName, *, same: bool) -> None:
+        self._tell(self.shell.rules_compared, peer, same=same)
+
     def stream_added(self, stream: StreamInfo) -> None:
         self._tell(self.shell.stream_added, stream)
 
@@ -114,7 +132,9 @@ class GuardedEvents:
 class Relayed:
     """One stream at the relay: where it comes from (None: the relay itself), where it goes, what is kept of it."""
 
-    __slots__ = ("cache", "kept_seq", "outs", "source", "stream", "unopened", "waiting")
+    __slots__ = (
+        "cache", "kept_seq", "offered_again", "outs", "refused_by", "source", "stream", "unopened", "waiting",
+    )  # fmt: skip
 
     def __init__(self, source: Link | None, stream: InStream, replays: ReplayStore) -> None:
         self.source = source
@@ -122,6 +142,8 @@ class Relayed:
         self.outs: dict[ClientName, tuple[Link, OutChannel]] = {}
         self.waiting: dict[ClientName, None] = {}  # subscribers that are still to be told of it, in their order
         self.unopened: set[ClientName] = set()  # subscribers towards whom no channel could be opened; they were told
+        self.refused_by: set[ClientName] = set()  # peers that take its client to be elsewhere (`offers_again`)
+        self.offered_again: dict[ClientName, int] = {}  # peers that were offered it again, in which epoch of its client
         self.kept_seq = 0  # of the newest message that was looked at for what the relay keeps
         self.cache: LatchedCache | None = None
         self.keep_latched(replays)

@@ -8,7 +8,8 @@ taken, and of the subscriptions that arrive meanwhile only the newest counts: ea
 from collections.abc import Callable
 from typing import Final
 
-from sern_core.relay.routing import UNIT_S, RouteChange, RoutingTable
+from sern_core.relay.route_change import RouteChange
+from sern_core.relay.routing import UNIT_S, RoutingTable
 from sern_core.vocabulary.types import ClientName
 
 MATCHING_SHARE: Final = 1.0 / 3.0

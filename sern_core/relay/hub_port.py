@@ -58,7 +58,8 @@ class HubPort:
         self.address = address
         self._greets = greets
         self.link: Link | None = None
-        self._out: list[bytes] = []
+        self.replies: list[bytes] = []
+        """What is to be said that is of no session."""
         self._reset_due_s = -float("inf")
 
     @property
@@ -110,23 +111,34 @@ class HubPort:
                 self._refuse(header.tag, "version", str(error), now)
         elif header.kind == framing.Kind.DATA and now >= self._reset_due_s:
             self._reset_due_s = now + RESET_INTERVAL_S
-            self._out.append(framing.encode_handshake(framing.Kind.RESET, header.tag, microseconds(now), {}))
+            self._reset(header.tag, now)
 
-    def displace(self, tag: int, by: "HubPort", *, now: float) -> None:
-        """Another process has connected under the client's name: say so to the one whose session `tag` was here."""
-        where = f" from {by.address}" if by.address else ""
-        text = f"another process connected as {self.client}{where}; one name has one connection: end one of the two, "
+    def _reset(self, tag: int, now: float) -> None:
+        self.replies.append(framing.encode_handshake(framing.Kind.RESET, tag, microseconds(now), {}))
+
+    def forget(self, tag: int, *, now: float) -> None:
+        """The client's link is gone, whose latest session was `tag`. A client that thinks it has that session still
+        would wait for good for what it has sent: a stream loses nothing, so it asks for nothing twice."""
+        self.link = None
+        if not self._greets:
+            self._reset(tag, now)
+
+    def displace(self, tag: int, where: str, *, now: float) -> None:
+        """Another process has connected under the client's name: say so to the one whose session `tag` was here.
+        `where` is "from" an address or "at" another relay."""
+        text = f"another process connected as {self.client} {where}".rstrip()
+        text += "; one name has one connection: end one of the two, "
         self._refuse(tag, DISPLACED, text + "or give it a name and a key of its own", now)
 
     def _refuse(self, tag: int, code: str, text: str, now: float) -> None:
-        self._out.clear()
-        self._out.append(
+        self.replies.clear()
+        self.replies.append(
             framing.encode_handshake(framing.Kind.REFUSE, tag, microseconds(now), {"code": code, "why": text})
         )
 
     def next_datagram(self, *, now: float) -> bytes | None:
-        if self._out:
-            return self._out.pop(0)
+        if self.replies:
+            return self.replies.pop(0)
         link = self.link
         if link is None or self.hub.clients.port_of.get(self.client) is not self:
             return None
@@ -156,7 +168,7 @@ class HubPort:
 
     @property
     def dirty(self) -> bool:
-        if self._out:
+        if self.replies:
             return True
         link, hub = self.link, self.hub
         if link is None or hub.clients.port_of.get(self.client) is not self:

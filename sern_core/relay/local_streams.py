@@ -1,6 +1,6 @@
 """Streams of the relay itself: what its feed takes in, published under a name of its own like any client's. Pure."""
 
-from collections.abc import Container
+from collections.abc import Callable, Container
 
 from sern_core.relay.forwarding import Forwarding
 from sern_core.relay.hub_events import Relayed
@@ -15,7 +15,7 @@ from sern_core.wire.numbering import Numbering
 
 class LocalStreams:
     """The publishing half of a relay. `owners` are the names under which it publishes; no client may have one of them,
-    and `clients` are those that do have names. `boot` is the relay's own."""
+    and `clients` are those that do have names. `boot` is the relay's own. `owned` is told before it publishes."""
 
     def __init__(
         self,
@@ -26,6 +26,8 @@ class LocalStreams:
         numbering: Numbering,
         streams: RelayedStreams,
         forwarding: Forwarding,
+        *,
+        owned: Callable[[float], None],
     ) -> None:
         self._boot = boot
         self._owners = owners
@@ -34,6 +36,7 @@ class LocalStreams:
         self._numbering = numbering
         self._streams = streams
         self._forwarding = forwarding
+        self._owned = owned
 
     def open(self, info: TopicInfo, spec: TopicSpec, owner: ClientName, *, now: float) -> Relayed:
         """Publish a topic from here, under the name of `owner`, who then owns the topic's name like any client.
@@ -44,6 +47,7 @@ class LocalStreams:
         if owner in self._clients:
             raise RefusedError("name_taken", f"{owner} is the name of a client; give the feed's role another name")
         self._owners.add(owner)
+        self._owned(now)
         identity = StreamId(owner, self._boot, info.name)
         held = self._streams.by_id.get(identity)
         stream = InStream(

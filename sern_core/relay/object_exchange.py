@@ -1,11 +1,8 @@
 """Objects over the link, the relay's half: what clients put is taken in, and those who subscribe are told. Pure.
 
-`node:NAME` is the object of the client of that name, which needs no right for it. Any other id stands for a global
-name: itself, without the `@client` at its end, under the leading `/` of names. Who may publish that name may put it,
-who may subscribe to it is told of it; `node:NAME` is told to who may subscribe to `/NAME/node`.
+Who may is said by `object_rights`; what other relays tell and are told is in `peer_objects`.
 """
 
-import re
 from collections import Counter
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -30,47 +27,26 @@ from sern_core.objects.feed import ObjectFeed
 from sern_core.objects.registry import ObjectRegistry
 from sern_core.objects.xr_object import XrObject
 from sern_core.relay.access import AccessTable
+from sern_core.relay.object_rights import check_right, name_of
+from sern_core.relay.peer_objects import KINDS, PeerObjects
 from sern_core.stream.in_stream import InStream
 from sern_core.stream.out_channel import OutChannel
 from sern_core.topics.patterns import Pattern, PatternError, compile_pattern
 from sern_core.vocabulary.errors import RefusedError, UsageError, WireError
-from sern_core.vocabulary.message import Message
-from sern_core.vocabulary.types import ClientName, ObjectKind, TopicName
+from sern_core.vocabulary.message import Message, StreamId
+from sern_core.vocabulary.names import is_peer
+from sern_core.vocabulary.types import ClientName, ObjectKind
 from sern_core.wire import framing
 
-NODE: Final = "node:"
-"""How the id of a client's own object begins."""
-_OWNED: Final = re.compile(r"(.*)@[a-z][a-z0-9_]{0,62}", re.DOTALL)
 MAX_TEXTS_BYTES: Final = 2**20
 """Texts of definitions that a client has sent and that its next objects may name."""
 CHANGE_US: Final = 40
 BYTES_PER_US: Final = 64
 PATTERN_US: Final = 100
 LOOK_US: Final = 2
-"""What a client is charged with: a change of an object, its size, a pattern, and an object that one is held against."""
-
-
-def name_of(object_id: str) -> TopicName:
-    """The global name that an object's id stands for."""
-    if object_id.startswith(NODE):
-        return TopicName(f"/{object_id.removeprefix(NODE)}/node")
-    owned = _OWNED.fullmatch(object_id)
-    return TopicName("/" + (object_id if owned is None else owned[1]).lstrip("/"))
-
-
-def check_right(access: AccessTable, client: ClientName, object_id: str) -> None:
-    """Raises RefusedError when the client may not have an object of this id."""
-    if object_id.startswith(NODE):
-        if object_id != NODE + client:
-            raise RefusedError("not_owner", f"{client} may not put {object_id[:80]}: it belongs to the client it names")
-        return
-    name = TopicName("/" + object_id.removesuffix(f"@{client}").lstrip("/"))
-    if not access.may_publish(client, name):
-        raise RefusedError(
-            "forbidden",
-            f"{client} may not put {object_id[:80]}: no access rule lets it publish {name[:80]}; "
-            "add it under access.publish",
-        )
+SHOW_US: Final = 60
+"""What a client is charged with: a change of an object, its size, a pattern, an object that one is held against; and a
+peer for showing what it tells."""
 
 
 class _Want(NamedTuple):
@@ -103,7 +79,8 @@ class _Owner:
 
 class ObjectExchange:
     """`access` are the rules of now; `text_of` gives the text of an object's definition; `refused(client, code, text)`
-    is told what is not taken; `attempt` does something about a client so that its failure is that client's."""
+    is told what is not taken; `attempt` does something about a client so that its failure is that client's. `home`
+    names the peer that a client is at, `via` the one that a stream comes from."""
 
     def __init__(
         self,
@@ -114,6 +91,8 @@ class ObjectExchange:
         text_of: Callable[[XrObject], str],
         refused: Callable[[ClientName, str, str], None],
         attempt: Callable[[ClientName, float, Callable[[], object]], None],
+        home: Callable[[ClientName], ClientName | None],
+        via: Callable[[StreamId], ClientName | None],
     ) -> None:
         self._attempt = attempt
         self._registry = registry
@@ -122,18 +101,31 @@ class ObjectExchange:
         self._text_of = text_of
         self._refused = refused
         self._owners: dict[ClientName, _Owner] = {}
+        self._strayed: set[ClientName] = set()  # of those: have been at a peer since they told us what they have
         self._wants: dict[ClientName, tuple[_Want, ...]] = {}
         self._asked: dict[ClientName, object] = {}  # what each said last, as it said it
         self.feeds: dict[ClientName, ObjectFeed] = {}
-        """By the client that is told."""
+        """What each client is told, by its name."""
         self._first = 1  # a client that was forgotten and comes back has read so many messages of the stream
         self.counts: Counter[str] = Counter()
-        """Changes that clients sent: `taken`, or the code of the refusal."""
+        """Changes that clients and other relays sent: `taken`, or the code of the refusal."""
+        self.peers = PeerObjects(
+            registry,
+            links,
+            access=access,
+            text_of=text_of,
+            refused=refused,
+            attempt=attempt,
+            home=home,
+            via=via,
+            counts=self.counts,
+        )
+        """What other relays tell and are told."""
 
     # --- what clients put -----------------------------------------------------------------------------------------
 
     def message(self, link: Link, stream: InStream, message: Message, *, now: float) -> None:
-        """A change of a client's objects has its turn."""
+        """A change of a client's objects has its turn, or of those at another relay."""
         client = link.peer
         link.taking.confirm(stream, message.seq)
         if message.drop_marker:
@@ -144,11 +136,21 @@ class ObjectExchange:
             change = decode(message.body)
             if isinstance(change, (Put, Set, Delete)):
                 object_id = change.object_id
-            elif isinstance(change, Define):  # it came packed
+                if not isinstance(change, Delete):  # the value came packed
+                    link.reassembly.work_us += len(change.value or b"") // BYTES_PER_US
+            elif isinstance(change, Define):  # so did it
                 link.reassembly.work_us += len(change.text) // BYTES_PER_US
+            if is_peer(client):
+                link.reassembly.work_us += SHOW_US
+                if self.peers.far.take(client, change, now=now):
+                    self.pump(now=now)
+                return
             self._apply(self._owners.setdefault(client, _Owner()), client, change, now)
         except (RefusedError, WireError) as error:
             code = error.code if isinstance(error, RefusedError) else "bad_object"
+            if is_peer(client):
+                self.peers.far.refuse(client, client, code, str(error))
+                return
             self.counts[code] += 1
             self._refused(client, code, str(error))
             self._say_refused(link, object_id, code, str(error), now)
@@ -243,6 +245,9 @@ class ObjectExchange:
     def subscribe(self, link: Link, envelope: framing.Envelope, *, now: float) -> None:
         """A client says which objects it wants, and what it has. Raises WireError for what no honest client sends,
         RefusedError for a pattern that is none."""
+        if is_peer(link.peer):
+            self.peers.subscribe(link, envelope, now=now)
+            return
         client = link.peer
         kinds = framing.take_strings(envelope, "kinds", max_length=16)
         patterns = framing.take_strings(envelope, "match")
@@ -250,7 +255,7 @@ class ObjectExchange:
         bare = framing.take_int(envelope, "bare", default=0)
         if len(kinds) != len(patterns) or len(kinds) > MAX_WANTS:
             raise WireError(f"a subscription of {len(kinds)} kinds and {len(patterns)} patterns of objects")
-        if not set(kinds) <= _KINDS:
+        if not set(kinds) <= KINDS:
             raise WireError("a subscription to objects of an unknown kind")
         feed = self.feeds.get(client)
         if bare > len(kinds):
@@ -268,6 +273,7 @@ class ObjectExchange:
             raise RefusedError("bad_pattern", f"{client} may not subscribe to objects: {error}") from error
         self._asked[client] = asked
         self._wants[client] = wants
+        self._tell_peers()
         every_kind = any(want.kind is None for want in wants)
         told = None if every_kind else frozenset(want.kind for want in wants if want.kind is not None)
         if feed is None:
@@ -303,34 +309,60 @@ class ObjectExchange:
     def _wants_value(self, client: ClientName, object_id: str, kind: ObjectKind) -> bool:
         return any(want.valued and want.matches(object_id, kind) for want in self._wants[client])
 
+    def _tell_peers(self) -> None:
+        """Other relays are asked for the values that clients want."""
+        self.peers.want(
+            (str(want.kind or ""), want.pattern.pattern)
+            for wants in self._wants.values()
+            for want in wants
+            if want.valued
+        )
+
     def pump(self, *, now: float) -> None:
         """Tell those who subscribe what is due. Call ten times a second."""
         for client, feed in list(self.feeds.items()):
-            self._attempt(client, now, partial(feed.pump, now=now))
+            if not feed.at_rest:
+                self._attempt(client, now, partial(feed.pump, now=now))
+        self.peers.pump(now=now)
 
     def revoke(self) -> None:
         """There are new access rules: everyone is told anew what it may have, and forgets what it may not."""
         for feed in self.feeds.values():
             feed.restart()
+        self.peers.far.revoke()
 
     # --- news of the link -----------------------------------------------------------------------------------------
 
     def came(self, link: Link, *, resumed: bool, now: float) -> None:
         """A session has begun. Another process has nothing of what the one before was told, and says what it wants;
         and of one that was forgotten nothing is here."""
+        if is_peer(link.peer):
+            self.peers.up(link, resumed=resumed, now=now)
+            return
+        self.peers.moved(link.peer, now=now)
         if not resumed:
             self._asked.pop(link.peer, None)
             if link.peer in self.feeds:
                 self.feeds[link.peer].idle = True
+        if not resumed or link.peer in self._strayed:
+            self._strayed.discard(link.peer)
             link.control.send({"t": "objects_lost"}, now=now)
 
+    def went(self, client: ClientName, *, now: float) -> None:
+        """A client is at a peer, whose word counts for its objects now."""
+        if client in self._owners:
+            self._strayed.add(client)
+        self.peers.moved(client, now=now)
+
     def delivered(self, link: Link, channel: OutChannel, *, now: float) -> None:
+        self.peers.delivered(link, channel, now=now)
         feed = self.feeds.get(link.peer)
         if feed is not None and feed.channel is channel:
             feed.pump(now=now)
 
     def dropped(self, link: Link, channel: OutChannel) -> None:
         """Something of what was told will not arrive."""
+        self.peers.dropped(link, channel)
         feed = self.feeds.get(link.peer)
         if feed is not None and feed.channel is channel:
             feed.dropped()
@@ -340,20 +372,31 @@ class ObjectExchange:
         if feed is not None:
             self._first = max(self._first, feed.channel.next_seq)
         self._owners.pop(client, None)
-        self._wants.pop(client, None)
+        self._strayed.discard(client)
         self._asked.pop(client, None)
+        if self._wants.pop(client, None) is not None:
+            self._tell_peers()
+        if is_peer(client):
+            self.peers.forget(client)
+        else:
+            self.peers.far.forget(client)
+
+    def every_feed(self) -> list[ObjectFeed]:
+        """Those that tell clients and those that tell other relays."""
+        return [*self.feeds.values(), *self.peers.feeds.values()]
 
     def channels(self) -> set[int]:
         """Identities of the channels of feeds, for tests."""
-        return {id(feed.channel) for feed in self.feeds.values()}
+        return {id(feed.channel) for feed in self.every_feed()}
 
     def validate(self) -> None:
         """Internal consistency, for tests."""
         assert self.feeds.keys() == self._wants.keys() >= self._asked.keys(), "who is told, and of what"
+        assert self._strayed <= self._owners.keys(), "clients that told nothing have nothing to tell again"
         assert self._owners.keys() | self.feeds.keys() <= self._links.keys(), "objects of clients that are gone"
         for feed in self.feeds.values():
             feed.validate()
+        self.peers.validate()
 
 
-_KINDS: Final = frozenset(ObjectKind) | {""}
-__all__ = ["NODE", "OBJECTS_TOPIC", "ObjectExchange", "check_right", "name_of"]
+__all__ = ["OBJECTS_TOPIC", "ObjectExchange"]

@@ -9,6 +9,9 @@ A peer whose last stream has ended is one no more. The client is told whether it
 session: a robot that is gone is given up, one that is here has nothing for the client any more. Of those that were not
 here it is told once they are, and it may ask of those that it knows from an earlier session.
 
+Another relay asks as a client does, and is told of the clients that are here. What it says of those that are there goes
+on to whoever asked here, with the round trip between the two relays added.
+
 What is told travels as control messages, so that bulk cannot hold it up, and is bounded by what there is to know: of
 each peer only its latest state waits, and nothing is said before the client has acknowledged what was said last.
 """
@@ -21,9 +24,11 @@ from typing import Final, NamedTuple, Protocol
 
 from sern_core.link.view import LinkView
 from sern_core.vocabulary.limits import PeerLimits
+from sern_core.vocabulary.names import is_peer
 from sern_core.vocabulary.types import ClientName
 from sern_core.wire import framing
 from sern_core.wire.announce import MAX_ASKED
+from sern_core.wire.peer_states import PeerState, peer_states
 
 MAX_TOLD: Final = 24
 """Peers in one message: an envelope holds 4 KiB."""
@@ -72,6 +77,14 @@ class _State(NamedTuple):
     rtt_at_s: float
     moved: bool
     """It has gone to another relay, and said so."""
+
+
+class _There(NamedTuple):
+    """What a peer relay says of a client of its own: `since_s` by our clock."""
+
+    relay: ClientName
+    state: PeerState
+    since_s: float
 
 
 class _Watcher:
@@ -124,6 +137,7 @@ class Presence:
         self._subscribers: dict[ClientName, set[ClientName]] = {}  # the same the other way round
         self._states: dict[ClientName, _State] = {}  # of those in `_subscribers`, as they were looked at last
         self._watchers: dict[ClientName, _Watcher] = {}
+        self._there: dict[ClientName, _There] = {}  # clients of other relays, as far as those say
         self._asked: dict[ClientName, set[ClientName]] = {}  # of whom a client asked, until it is known what it takes
 
     # --- who takes whose streams ----------------------------------------------------------------------------------
@@ -154,6 +168,7 @@ class Presence:
         if not subscribers:
             del self._subscribers[origin]
             self._states.pop(origin, None)
+            self._there.pop(origin, None)
         self._due(subscriber, origin)
 
     def _due(self, watcher: ClientName, peer: ClientName) -> None:
@@ -177,7 +192,7 @@ class Presence:
         asked.update([name for name in names if name not in self._local][: MAX_ASKED - len(asked)])
 
     def changed(self, client: ClientName, *, now: float) -> None:
-        """The client's session has begun or ended: nobody waits for `sweep`."""
+        """The client's session has begun or ended, here or at another relay: nobody waits for `sweep`."""
         self._watchers.pop(client, None)  # what it was told was of the session before
         self._asked.pop(client, None)
         for watching in self._watchers.values():
@@ -186,10 +201,43 @@ class Presence:
                     watching.back[client] = now
                 else:
                     watching.back.pop(client, None)
-        if client in self._subscribers:
-            self._look(client, now)
-            for subscriber in self._subscribers[client]:
-                self._tell(subscriber, now)
+        there = self._there.get(client)
+        if there is not None and there.relay != self._home(client):
+            del self._there[client]
+        for subscriber in self._subscribers.get(client, ()):
+            if is_peer(subscriber):  # it may have been told by another relay until now
+                self._due(subscriber, client)
+        self._look_now([client], now)
+
+    def relay_changed(self, relay: ClientName, *, now: float) -> None:
+        """The session with another relay has begun or ended."""
+        self._watchers.pop(relay, None)
+        for client in [client for client, there in self._there.items() if there.relay == relay]:
+            del self._there[client]
+        self._look_now([client for client in self._subscribers if self._home(client) == relay], now)
+
+    def told(self, relay: ClientName, envelope: framing.Envelope, *, now: float) -> None:
+        """Another relay says how clients of its own are reached: of others it is not believed. Raises WireError."""
+        clients = []
+        for state in peer_states(envelope):
+            if self._home(state.name) != relay:
+                continue
+            if state.up is None or state.name not in self._subscribers:
+                self._there.pop(state.name, None)
+            else:
+                self._there[state.name] = _There(relay, state, now - state.for_s)
+                clients.append(state.name)
+        self._look_now(clients, now)
+
+    def _look_now(self, clients: Iterable[ClientName], now: float) -> None:
+        """See how these are, and tell whom it concerns."""
+        concerned: dict[ClientName, None] = {}
+        for client in clients:
+            if client in self._subscribers:
+                self._look(client, now)
+                concerned.update(dict.fromkeys(self._subscribers[client]))
+        for subscriber in concerned:
+            self._tell(subscriber, now)
 
     def sweep(self, *, now: float) -> None:
         """See whose path has fallen silent or answers again, and say what is due. Call about once a second, and then
@@ -223,17 +271,25 @@ class Presence:
                 watching.back[peer] = now
 
     def _look(self, client: ClientName, now: float) -> None:
-        link = self._links.get(self._home(client) or client)
+        home = self._home(client)
+        link = self._links.get(home or client)
         view = None if link is None else link.observe(now=now)
+        there = self._there.get(client)
+        said = None if there is None else there.state
         old = self._states.get(client)
-        up = view is not None and view.up
+        up = view is not None and view.up and (said is None or said.up is True)
         since_s = now if old is None or old.up != up else old.since_s
+        if there is not None and said is not None and not said.up:
+            since_s = min(since_s, there.since_s)
         lane, rtt_s, rtt_at_s = ("", None, now) if old is None else (old.lane, old.rtt_s, old.rtt_at_s)
         if view is not None and up:
-            lane = view.lane
-            if view.srtt_s and _differs(rtt_s, view.srtt_s) and (rtt_s is None or now - rtt_at_s >= RTT_PAUSE_S):
-                rtt_s, rtt_at_s = view.srtt_s, now
-        moved = link is not None and not link.established and link.moved
+            lane, new_rtt_s = view.lane, view.srtt_s
+            if said is not None:
+                lane, new_rtt_s = said.lane, view.srtt_s + said.rtt_s if view.srtt_s and said.rtt_s else 0.0
+            if new_rtt_s and _differs(rtt_s, new_rtt_s) and (rtt_s is None or now - rtt_at_s >= RTT_PAUSE_S):
+                rtt_s, rtt_at_s = new_rtt_s, now
+        here_moved = link is not None and not link.established and link.moved
+        moved = here_moved if said is None else said.moved
         state = _State(up, since_s, lane, rtt_s, rtt_at_s, moved)
         if state != old:
             self._states[client] = state
@@ -253,6 +309,8 @@ class Presence:
 
     def _say(self, client: ClientName, watching: _Watcher, link: PeerLink, now: float) -> None:
         due = sorted(watching.due)
+        if is_peer(client):  # of those at yet another relay that one tells it itself
+            due = [each for each in due if self._home(each) is None]
         for start in range(0, len(due), MAX_TOLD):
             items = [self._item(client, watching, peer, now) for peer in due[start : start + MAX_TOLD]]
             watching.seq = link.control.send({"t": "peers", "peers": items}, now=now)
@@ -288,6 +346,7 @@ class Presence:
         subscribers = {(origin, subscriber) for origin, some in self._subscribers.items() for subscriber in some}
         assert subscribers == {(origin, subscriber) for subscriber, origins in taken.items() for origin in origins}
         assert self._states.keys() <= self._subscribers.keys(), "states of clients of whom nobody takes anything"
+        assert self._there.keys() <= self._subscribers.keys(), "told of clients of whom nobody takes anything"
         assert self._watchers.keys() <= self._links.keys(), "clients are told that are gone"
         assert self._asked.keys() <= self._links.keys(), "clients ask that are gone"
 

@@ -6,14 +6,15 @@ from typing import Final
 
 from sern_core.link.link import Link
 from sern_core.objects.registry import ObjectRegistry
-from sern_core.relay.access import AccessTable
+from sern_core.relay.access import AccessTable, Right
 from sern_core.relay.clients import Clients
 from sern_core.relay.draining import Draining
 from sern_core.relay.hub_events import GuardedEvents, Relayed
 from sern_core.relay.hub_fanout import Fanout
 from sern_core.relay.moves import Moves
 from sern_core.relay.presence import Presence
-from sern_core.relay.routing import UNIT_S, RouteChange, RoutingTable
+from sern_core.relay.route_change import RouteChange
+from sern_core.relay.routing import UNIT_S, RoutingTable
 from sern_core.stream.in_stream import InStream
 from sern_core.stream.latched import ReplayStore, as_replays, newest_that_fit, waiting_bytes
 from sern_core.stream.out_channel import OutChannel
@@ -21,7 +22,7 @@ from sern_core.vocabulary.errors import RefusedError, UsageError, WireError
 from sern_core.vocabulary.limits import PeerLimits
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo
 from sern_core.vocabulary.names import is_peer
-from sern_core.vocabulary.types import ClientName, DropReason
+from sern_core.vocabulary.types import ClientName, DropReason, TopicName
 from sern_core.wire.announce import check_onwards
 
 STREAM_US: Final = 50
@@ -35,7 +36,7 @@ MAX_DENIED: Final = 64
 
 
 class RelayedStreams:
-    """`ended` is told of the end of a stream of the relay's own; `home` and `moved` are of `Moves`."""
+    """`ended` is told of the end of a stream of the relay's own; `home` is of `Moves`."""
 
     def __init__(
         self,
@@ -50,7 +51,6 @@ class RelayedStreams:
         ended: Callable[[Relayed, float], None],
         limits: PeerLimits,
         home: Callable[[ClientName], ClientName | None],
-        moved: Callable[[ClientName, float], bool],
         now: float,
     ) -> None:
         self._clients = clients
@@ -60,12 +60,17 @@ class RelayedStreams:
         self._events = events
         self._wall_ns = wall_ns
         self._ended = ended
-        self.moves = Moves(clients, routing, self, home=home, moved=moved)
+        self._home = home
+        self.moves = Moves(clients, routing, self, home=home)
         routing.route_units = self._replay_units
         self.by_id: dict[StreamId, Relayed] = {}
         self.replays = ReplayStore(cache_bytes)
         self.fanout = Fanout(self.offer, self.told, self._let_go)
         self.draining = Draining(self._end_channel, limits)
+        self.check: Callable[[StreamInfo], None] = lambda _stream: None
+        """Raises RefusedError where there is anything against a stream beside what routing knows; set by the owner."""
+        self.changed: Callable[[TopicName, float], None] = lambda _topic, _now: None
+        """Told that a stream of that name has begun, ended, or comes from elsewhere; set by the owner."""
         self.tap: Callable[[StreamInfo], bool] = lambda _stream: False
         """Whether the relay itself wants a stream (a subscriber of the feed); set by the shell."""
         self.on_disk: Callable[[StreamId], int] = lambda _stream: 0
@@ -90,6 +95,7 @@ class RelayedStreams:
                 text = f"{identity.origin} may not publish {identity.topic[:80]!r}: nobody would take its announcement"
                 raise RefusedError("bad_announcement", f"{text}: {error}") from None
             via = source.peer if source is not None and is_peer(source.peer) else None
+            self.check(stream.stream)
             change = self._routing.announce(stream.stream, via=via)
         except RefusedError:
             self.apply(self._routing.withdraw(identity), now)
@@ -111,7 +117,26 @@ class RelayedStreams:
             except RefusedError as refusal:
                 self._events.refused(identity.origin, refusal.code, str(refusal))
         self.apply(change, now, source=source)
+        self.changed(identity.topic, now)
         return relayed
+
+    def relocate(self, identity: StreamId, peer: ClientName, now: float) -> None:
+        """The origin of a stream has gone to a peer: from there other relays get it, and from there it is to come, if
+        anybody here takes it."""
+        self.apply(self._routing.relocate(identity, peer), now)
+        if self.by_id[identity].outs:
+            self.moves.left_for(identity, now)
+            self.changed(identity.topic, now)
+        else:
+            self.apply(self._routing.withdraw(identity), now)
+
+    def refuse(self, identity: StreamId, code: str, text: str, now: float) -> None:
+        """Take a stream no more that was taken."""
+        relayed = self.by_id[identity]
+        if relayed.source is not None:
+            relayed.source.taking.refuse(relayed.stream, code, text, now=now)
+        self._events.refused(identity.origin, code, text)
+        self.apply(self._routing.withdraw(identity), now)
 
     def retract(self, link: Link, stream: InStream, now: float) -> None:
         """A client has a stream no more."""
@@ -154,7 +179,8 @@ class RelayedStreams:
             if relayed is not None:
                 self.told(relayed, now)
         for denied in change.denied[:MAX_DENIED]:
-            text = f"{denied.client} may not subscribe to {denied.topic}: no access rule grants it"
+            whose = f" of the relay {denied.by[1:]}, where it comes from," if denied.by else ""
+            text = f"{denied.client} may not subscribe to {denied.topic}: no access rule{whose} grants it"
             self._events.refused(denied.client, "forbidden", text)
             said = {"t": "denied", "topic": denied.topic, "code": "forbidden", "why": text}
             self._clients.tell(denied.client, said, now)
@@ -183,6 +209,7 @@ class RelayedStreams:
                     self._end_channel(client, link, channel, DropReason.FORBIDDEN, now)
         self._objects.delete_stream(identity)
         self._events.stream_removed(relayed.stream.stream)
+        self.changed(identity.topic, now)
 
     def revoke(self, access: AccessTable, now: float) -> None:
         """There are new access rules, and clients have their limits: what they no longer allow ends now."""
@@ -198,6 +225,11 @@ class RelayedStreams:
         self.apply(change, now, reason=DropReason.FORBIDDEN)
         self.draining.keep(self._may_drain, DropReason.FORBIDDEN, now=now)
 
+    def rejudge(self, peer: ClientName, now: float) -> None:
+        """The rules of a peer are others than before: what they no longer allow ends now."""
+        self.apply(self._routing.rejudge(peer), now, reason=DropReason.FORBIDDEN)
+        self.draining.keep(self._may_drain, DropReason.FORBIDDEN, now=now)
+
     def drop_client(self, client: ClientName, reason: DropReason, now: float) -> None:
         """The client is given up: its streams end, and what waits for it is dropped for `reason`."""
         link = self._clients.links[client]
@@ -211,8 +243,9 @@ class RelayedStreams:
 
     def _may_drain(self, client: ClientName, stream: StreamId) -> bool:
         """Whether the rules allow what an ended stream left behind."""
-        access = self._clients.access
-        may = is_peer(client) or access.may_subscribe(client, stream.topic)
+        access, topic = self._clients.access, stream.topic
+        granted = self._routing.rights.grants(self._home(stream.origin), client, topic, Right.SUBSCRIBE)
+        may = is_peer(client) or (granted and access.may_subscribe(client, topic))
         return may and access.may_publish(stream.origin, stream.topic)
 
     # --- to subscribers -------------------------------------------------------------------------------------------
@@ -244,9 +277,9 @@ class RelayedStreams:
             relayed.outs[client] = ended
             self._presence.joined(identity.origin, client)
             return
-        held = self.moves.begin_for(client, relayed) if self._routing.peers else None
+        held = self.moves.begin_for(client, relayed, first) if self._routing.peers else None
         if held is not None:
-            first = min(first, held.watermark + 1)
+            first = held.watermark + 1
         try:
             replays = self.latched(link, relayed, first, now)
             channel = link.outgoing.open(stream, first=first, now=now, replays=replays)
@@ -263,6 +296,8 @@ class RelayedStreams:
             self._presence.joined(identity.origin, client)
             if held is not None:
                 self.moves.go_on_with(held, link, channel, now)
+            if self._routing.peers:
+                self.moves.began(client, relayed, now)
 
     def close(self, client: ClientName, identity: StreamId, reason: DropReason, now: float) -> None:
         """Close the channel, if there is one."""
@@ -270,6 +305,8 @@ class RelayedStreams:
         if relayed is None:
             return
         self.moves.leave(client, identity)
+        if reason is DropReason.UNWANTED and client in relayed.outs and is_peer(client):
+            self.moves.keep(relayed, client, now)
         relayed.unopened.discard(client)
         relayed.waiting.pop(client, None)
         pair = relayed.outs.pop(client, None)
@@ -281,6 +318,15 @@ class RelayedStreams:
 
     def _end_channel(self, client: ClientName, link: Link, channel: OutChannel, reason: DropReason, now: float) -> None:
         self._clients.attempt(client, now, partial(link.outgoing.close, channel, reason, now=now))
+
+    def rest(self, relayed: Relayed, peer: ClientName, now: float) -> None:
+        """Nobody behind a peer that is out of reach needs the stream from there: keep nothing for it until it says that
+        it wants it."""
+        link, channel = relayed.outs[peer]
+        self._unsubscribed = channel
+        self._clients.attempt(peer, now, partial(link.outgoing.rest, channel, now=now))
+        self._unsubscribed = None
+        self.confirm(relayed)
 
     def _let_go(self, client: ClientName, link: Link, channel: OutChannel, now: float) -> None:
         """The channel's stream has ended: deliver what still waits, or close it."""
@@ -305,7 +351,7 @@ class RelayedStreams:
         client, stream, cache = link.peer, relayed.stream.stream, relayed.cache
         if cache is None or cache.empty:
             return []
-        if not (is_peer(client) or self._clients.access.may_replay(client, stream.id.topic)):
+        if not self._routing.may_replay(client, stream.id):
             return []
         messages = self.replays.below(cache, first)
         for payer in (link, relayed.source):  # whoever of them is being read has set it off, and it counts there
@@ -405,4 +451,6 @@ class RelayedStreams:
             return None
         if channel is self._unsubscribed or (reason is DropReason.UNWANTED and link.peer not in relayed.outs):
             return None  # it is not required any more, also for what was sent whole, and others may have the message
+        if is_peer(link.peer) and channel is link.outgoing.declined and not channel.required:
+            return None  # nor is anybody behind a peer
         return relayed

@@ -22,7 +22,9 @@ Names
 Peers
 - Another relay is a client of another kind, a *peer* (`sern_core/relay/peers.py`): it subscribes for the clients behind
   it, whose rights it checks, and announces their streams, which keep their origins (`via`). What came from a peer is
-  offered to clients alone, so nothing goes round in circles; nor does a peer get what a relay publishes itself.
+  offered to clients alone, so nothing goes round in circles. What the relay publishes itself goes to peers, too, unless
+  one of them has the same name for it (`stays`).
+- Where rules differ, both relays' must grant a stream to its subscriber (`sern_core/relay/peer_rights.py`).
 
 Who announces is the caller's business: `StreamInfo.id.origin` must be the name bound to the peer's key.
 """
@@ -31,9 +33,11 @@ from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Container, Iterable
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from typing import Final
 
-from sern_core.relay.access import AccessTable
+from sern_core.relay.access import AccessTable, Right
+from sern_core.relay.peer_rights import PeerRights
+from sern_core.relay.route_change import NO_CHANGE, Denied, RouteChange, RouteCollector
 from sern_core.topics.patterns import MAX_CLIENT_PROGRAM, PatternError, PatternSet
 from sern_core.vocabulary.errors import RefusedError
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo
@@ -79,46 +83,6 @@ class RoutingLimits:
     """Matching that is done in one go."""
 
 
-class Match(NamedTuple):
-    """The client receives the stream."""
-
-    client: ClientName
-    stream: StreamId
-
-
-class Denied(NamedTuple):
-    """The client named the topic, and the access rules forbid it. Of what it has only patterns for, nothing is said:
-    it would learn what it may not see."""
-
-    client: ClientName
-    topic: TopicName
-
-
-@dataclass(frozen=True, slots=True)
-class RouteChange:
-    """What one call changed; every tuple is sorted and without duplicates.
-
-    `updated` streams kept their id and got other properties: announce them again to their subscribers.
-    `wanted` streams have a first subscriber, `unwanted` ones lost the last (removed streams are not listed there).
-    """
-
-    added: tuple[StreamId, ...] = ()
-    updated: tuple[StreamId, ...] = ()
-    removed: tuple[StreamId, ...] = ()
-    matched: tuple[Match, ...] = ()
-    unmatched: tuple[Match, ...] = ()
-    wanted: tuple[StreamId, ...] = ()
-    unwanted: tuple[StreamId, ...] = ()
-    denied: tuple[Denied, ...] = ()
-
-    def __bool__(self) -> bool:
-        """True when the caller has anything to do."""
-        return self != NO_CHANGE
-
-
-NO_CHANGE: Final = RouteChange()
-
-
 class _Interest:
     """What one client wants; `topics` are the known global names that it wants and may have.
 
@@ -157,6 +121,8 @@ class RoutingTable:
         """The names of other relays; set by the owner."""
         self.stays: Container[ClientName] = ()
         """Origins whose streams no peer gets; set by the owner."""
+        self.rights = PeerRights()
+        """What other relays' rules grant, and what may go to them."""
         self._via: dict[StreamId, ClientName] = {}  # the peer that a stream came from
         self._infos: dict[StreamId, StreamInfo] = {}
         self._routes: dict[StreamId, tuple[ClientName, ...]] = {}
@@ -165,6 +131,7 @@ class RoutingTable:
         self._boots: dict[ClientName, int] = {}
         self._retired: dict[ClientName, deque[int]] = {}
         self._interests: dict[ClientName, _Interest] = {}
+        self._wanted: tuple[str, ...] | None = None  # see `interests`; None: to be worked out
         self.spent_units = 0
         """What the last `announce`, `subscribe`, `go_on` or `set_access` has cost."""
         self.route_units: Callable[[StreamId], int] = lambda _stream: 0
@@ -215,6 +182,16 @@ class RoutingTable:
         entry = self._topics.get(topic)
         return tuple(entry.streams) if entry is not None else ()
 
+    def writers(self, topic: TopicName) -> list[tuple[StreamInfo, ClientName | None]]:
+        """The streams of a global name, and the peer that announced each."""
+        entry = self._topics.get(topic)
+        held = () if entry is None else entry.streams.values()
+        return [(self._infos[stream], self._via.get(stream)) for stream in held]
+
+    def topics_via(self, peer: ClientName) -> set[TopicName]:
+        """The names of the streams that the peer announced."""
+        return {stream.topic for stream, via in self._via.items() if via == peer}
+
     def pairs(self) -> tuple[tuple[ClientName, TopicName], ...]:
         """Every (client, topic) that uses an access right now; for `AccessTable.replaced`."""
         used = {(stream.origin, stream.topic) for stream in self._infos}
@@ -225,11 +202,16 @@ class RoutingTable:
         """The peer that announced the stream; None: a client did, or the relay itself."""
         return self._via.get(stream)
 
-    def interests(self) -> tuple[list[str], list[TopicName]]:
-        """The patterns and names that clients want, each once, sorted: what this relay asks its peers for."""
+    def interests(self) -> tuple[str, ...]:
+        """The patterns and names that clients want, each once: what this relay asks its peers for. The same object as
+        long as nothing has changed."""
+        if self._wanted is not None:
+            return self._wanted
         wanting = [interest for client, interest in self._interests.items() if client not in self.peers]
         patterns = {text for interest in wanting for text in interest.patterns.texts}
-        return sorted(patterns), sorted({name for interest in wanting for name in interest.exact})
+        names = {name for interest in wanting for name in interest.exact}
+        self._wanted = (*sorted(patterns), *sorted(names - patterns))
+        return self._wanted
 
     def unfinished(self, client: ClientName) -> bool:
         """Whether there are names that the client's interest was not matched with yet: call `go_on`."""
@@ -253,7 +235,7 @@ class RoutingTable:
         durable = stream.spec.durable
         reboot = not durable and self._boots.get(origin, boot) != boot
         self._check(stream, reboot=reboot)
-        change = _Collector()
+        change = RouteCollector()
         if known is not None:
             self._infos[stream.id] = stream
             if moved:
@@ -278,7 +260,7 @@ class RoutingTable:
         """The origin no longer offers the stream; nothing happens when it is unknown."""
         if stream not in self._infos:
             return NO_CHANGE
-        change = _Collector()
+        change = RouteCollector()
         self._remove(stream, change)
         return change.result(self._routes)
 
@@ -300,7 +282,7 @@ class RoutingTable:
                 f"and {self._limits.max_exact} are taken; join patterns with '|'",
             )
         old = self._interests.get(client)
-        denied = [Denied(client, name) for name in names if not self._may_have(client, name)]
+        denied = self._denials(client, names)
         if old is not None and old.patterns.texts == texts and old.exact == names:
             return RouteChange(denied=tuple(sorted(denied)))  # said again: it may be another process that asks
         self.spent_units += COMPILE_UNITS * sum(map(len, texts))
@@ -309,7 +291,7 @@ class RoutingTable:
         except PatternError as error:
             raise _refused(error, client) from None
         self.spent_units += COMPILE_UNITS * wanted.program
-        change = _Collector()
+        change = RouteCollector()
         change.denied.update(denied)
         self._set_interest(client, _Interest(wanted, names), change)
         return change.result(self._routes)
@@ -329,9 +311,10 @@ class RoutingTable:
         if interest is None:
             interest = self._interests[client] = _Interest(PatternSet(()), exact)
         exact.add(topic)
-        change = _Collector()
+        self._wanted = None
+        change = RouteCollector()
         if not self._may_have(client, topic):
-            change.denied.add(Denied(client, topic))
+            change.denied.update(self._denials(client, {topic}))
         elif topic in self._topics and topic not in interest.topics:
             interest.topics.add(topic)
             self._set_subscriber(client, topic, change, takes=True)
@@ -340,7 +323,7 @@ class RoutingTable:
     def go_on(self, client: ClientName) -> RouteChange:
         """Match the client's interest with some more of the names that are left; nothing happens when none is."""
         self.spent_units = 0
-        change = _Collector()
+        change = RouteCollector()
         interest = self._interests.get(client)
         if interest is not None:
             self._match_some(client, interest, change)
@@ -355,7 +338,7 @@ class RoutingTable:
     def drop_client(self, client: ClientName) -> RouteChange:
         """The client is gone for good: its streams, its names and its interest go. It may come back under any boot, and
         what it has at another relay stays. With a peer goes all that came from it."""
-        change = _Collector()
+        change = RouteCollector()
         self._set_interest(client, None, change)
         if client in self.peers:
             streams = [stream for stream, via in self._via.items() if via == client]
@@ -375,7 +358,7 @@ class RoutingTable:
         have gained one (see `unfinished`). A name that a client asked for and just lost is listed in `denied`."""
         before, self._access = self._access, access
         self.spent_units = 0
-        change = _Collector()
+        change = RouteCollector()
         for stream in tuple(self._infos):
             if not access.may_publish(stream.origin, stream.topic):
                 self._remove(stream, change)
@@ -383,7 +366,7 @@ class RoutingTable:
             change.denied.update(
                 Denied(client, name)
                 for name in interest.exact
-                if before.may_subscribe(client, name) and not self._may_have(client, name)
+                if client not in self.peers and before.may_subscribe(client, name) and not self._may_have(client, name)
             )
             for name in sorted(interest.topics):
                 if not self._may_have(client, name):
@@ -395,24 +378,99 @@ class RoutingTable:
 
     # Peers ----------------------------------------------------------------------------------------------------------
 
+    def peer_has(self, peer: ClientName) -> None:
+        """A client is at home at a peer that was not there before: see `unfinished`."""
+        interest = self._interests.get(peer)
+        if interest is not None:
+            interest.left = self._to_look_at(interest)
+
+    def rejudge(self, peer: ClientName) -> RouteChange:
+        """The rules of a peer are others than before: what they forbid ends now, for the rest see `unfinished`."""
+        self.spent_units = 0
+        change = RouteCollector()
+        names: set[TopicName] = set()
+        for stream in [stream for stream, via in self._via.items() if via == peer]:
+            names.add(stream.topic)
+            route = self._routes[stream]
+            change.before.setdefault(stream, route)
+            self._routes[stream] = tuple(client for client in route if self._gets(client, stream))
+            change.denied.update(self._denied_by_source(stream))
+        for client, interest in self._interests.items():
+            if client not in self.peers:
+                interest.left.extend(sorted((names & interest.topics).difference(interest.left)))
+        return change.result(self._routes)
+
+    def may_replay(self, client: ClientName, stream: StreamId) -> bool:
+        """Whether the rules let a client have earlier messages of a stream."""
+        if client in self.peers:
+            return self.rights.may_replay(self._access, client, stream.topic)
+        granted = self.rights.grants(self._via.get(stream), client, stream.topic, Right.REPLAY)
+        return granted and self._access.may_replay(client, stream.topic)
+
     def _may_have(self, client: ClientName, name: TopicName) -> bool:
-        """Whether the rules let a client have a topic. A peer is asked for what its clients want, and judges them."""
-        return client in self.peers or self._access.may_subscribe(client, name)
+        """Whether our rules let a client have a topic, or somebody at a peer."""
+        if client not in self.peers:
+            return self._access.may_subscribe(client, name)
+        may, looked = self.rights.may_have(self._access, client, name)
+        self.spent_units += NAME_UNITS * looked
+        return may
 
     def _gets(self, client: ClientName, stream: StreamId) -> bool:
         """Whether a subscriber of the stream's name gets the stream."""
+        via = self._via.get(stream)
         if client in self.peers:
-            return stream not in self._via and stream.origin not in self.stays
-        return client != stream.origin
+            return via is None and stream.origin not in self.stays
+        return client != stream.origin and self.rights.grants(via, client, stream.topic, Right.SUBSCRIBE)
 
-    def _move(self, stream: StreamId, via: ClientName | None, change: "_Collector") -> None:
+    def _denials(self, client: ClientName, names: set[TopicName]) -> list[Denied]:
+        """Which of the names that a client asks for it may not have. A peer is not told: it knows our rules."""
+        if client in self.peers:
+            return []
+        denied = [Denied(client, name) for name in names if not self._may_have(client, name)]
+        return denied + [
+            Denied(client, name, self._via[stream])
+            for name in names & self._topics.keys()
+            for stream in self._topics[name].streams.values()
+            if self.rights.denies(self._via.get(stream), client, name)
+        ]
+
+    def _denied_by_source(self, stream: StreamId) -> list[Denied]:
+        """Who has named a stream's topic and may not have it by the rules of the peer that it comes from."""
+        topic, via = stream.topic, self._via.get(stream)
+        if via is None:
+            return []
+        return [
+            Denied(client, topic, via)
+            for client in self._topics[topic].subscribers - self.peers
+            if topic in self._interests[client].exact and self.rights.denies(via, client, topic)
+        ]
+
+    def relocate(self, stream: StreamId, via: ClientName) -> RouteChange:
+        """The origin of a stream has gone to a peer, which may not have announced it yet."""
+        change = RouteCollector()
+        self._move(stream, via, change)
+        return change.result(self._routes)
+
+    def _move(self, stream: StreamId, via: ClientName | None, change: RouteCollector) -> None:
         """The stream is announced from another place than before."""
         change.before.setdefault(stream, self._routes[stream])
         self._via.pop(stream, None)
         if via is not None:
             self._via[stream] = via
+        self._route(stream, change)
+
+    def _route(self, stream: StreamId, change: RouteCollector) -> None:
         subscribers = self._topics[stream.topic].subscribers
         self._routes[stream] = tuple(sorted(client for client in subscribers if self._gets(client, stream)))
+        change.denied.update(self._denied_by_source(stream))
+
+    def judge(self, origin: ClientName) -> RouteChange:
+        """`stays` says something else of an origin than before."""
+        change = RouteCollector()
+        for stream in self.streams_of(origin):
+            change.before.setdefault(stream, self._routes[stream])
+            self._route(stream, change)
+        return change.result(self._routes)
 
     # Internals -------------------------------------------------------------------------------------------------------
 
@@ -460,7 +518,7 @@ class RoutingTable:
                     f"{origin} may not publish {topic}: {problem} at {other}; use one definition at both clients",
                 )
 
-    def _add(self, stream: StreamInfo, change: "_Collector") -> None:
+    def _add(self, stream: StreamInfo, change: RouteCollector) -> None:
         origin, _, name = stream.id
         self._infos[stream.id] = stream
         self._by_client.setdefault(origin, {})[name] = stream.id
@@ -474,9 +532,9 @@ class RoutingTable:
                     topic.subscribers.add(client)
         topic.streams[origin] = stream.id
         change.before.setdefault(stream.id, ())
-        self._routes[stream.id] = tuple(sorted(client for client in topic.subscribers if self._gets(client, stream.id)))
+        self._route(stream.id, change)
 
-    def _remove(self, stream: StreamId, change: "_Collector") -> None:
+    def _remove(self, stream: StreamId, change: RouteCollector) -> None:
         change.removed.add(stream)
         change.before.setdefault(stream, self._routes.pop(stream))
         del self._infos[stream]
@@ -489,8 +547,9 @@ class RoutingTable:
                 self._interests[client].topics.discard(stream.topic)
             del self._topics[stream.topic]
 
-    def _set_interest(self, client: ClientName, interest: _Interest | None, change: "_Collector") -> None:
+    def _set_interest(self, client: ClientName, interest: _Interest | None, change: RouteCollector) -> None:
         old = self._interests.pop(client, None)
+        self._wanted = None
         if interest is not None:
             interest.topics = old.topics if old is not None else set()
             self._interests[client] = interest
@@ -517,7 +576,7 @@ class RoutingTable:
             return interest.wants(name)
         return interest.wants(name) and self._may_have(client, name)
 
-    def _match_some(self, client: ClientName, interest: _Interest, change: "_Collector") -> None:
+    def _match_some(self, client: ClientName, interest: _Interest, change: RouteCollector) -> None:
         """Match names that are left against the client's rights and interest, one slice of them at least by one."""
         left = interest.left
         while left:
@@ -525,10 +584,9 @@ class RoutingTable:
             self.spent_units += NAME_UNITS
             if name not in self._topics:
                 continue  # gone meanwhile
-            takes = self._takes(client, interest, name)
-            if takes != (name in interest.topics):
-                (interest.topics.add if takes else interest.topics.discard)(name)
-                self._set_subscriber(client, name, change, takes=takes)
+            takes, took = self._takes(client, interest, name), name in interest.topics
+            (interest.topics.add if takes else interest.topics.discard)(name)
+            if (takes or took) and self._set_subscriber(client, name, change, takes=takes):
                 self.spent_units += ROUTE_UNITS
                 if takes:
                     self.spent_units += sum(map(self.route_units, self._topics[name].streams.values()))
@@ -537,15 +595,19 @@ class RoutingTable:
         if not interest.patterns.texts and not interest.exact:
             del self._interests[client]
 
-    def _set_subscriber(self, client: ClientName, name: TopicName, change: "_Collector", *, takes: bool) -> None:
-        topic = self._topics[name]
+    def _set_subscriber(self, client: ClientName, name: TopicName, change: RouteCollector, *, takes: bool) -> bool:
+        """Whether that changed a route."""
+        topic, changed = self._topics[name], False
         (topic.subscribers.add if takes else topic.subscribers.discard)(client)
         for stream in topic.streams.values():
-            if self._gets(client, stream):
-                route = self._routes[stream]
+            route = self._routes[stream]
+            at = bisect_left(route, client)
+            had, gets = at < len(route) and route[at] == client, takes and self._gets(client, stream)
+            if had != gets:
                 change.before.setdefault(stream, route)
-                at = bisect_left(route, client)
-                self._routes[stream] = (*route[:at], client, *route[at:]) if takes else route[:at] + route[at + 1 :]
+                self._routes[stream] = (*route[:at], client, *route[at:]) if gets else route[:at] + route[at + 1 :]
+                changed = True
+        return changed
 
     def validate(self) -> None:
         """Check the tables against each other and against brute force; raises AssertionError."""
@@ -579,41 +641,6 @@ class RoutingTable:
             assert topic.subscribers == subscribers, f"{name}: subscribers differ"
         for interest in self._interests.values():
             assert interest.topics <= self._topics.keys(), "interest in unknown names"
-
-
-class _Collector:
-    """Gathers one call's changes: routes are compared with how they were `before` it, so detours do not show."""
-
-    def __init__(self) -> None:
-        self.added: set[StreamId] = set()
-        self.removed: set[StreamId] = set()
-        self.denied: set[Denied] = set()
-        self.before: dict[StreamId, tuple[ClientName, ...]] = {}
-
-    def result(self, routes: dict[StreamId, tuple[ClientName, ...]]) -> RouteChange:
-        matched: list[Match] = []
-        unmatched: list[Match] = []
-        wanted: list[StreamId] = []
-        unwanted: list[StreamId] = []
-        for stream, before in sorted(self.before.items()):
-            after = routes.get(stream, ())
-            if before == after:
-                continue
-            matched += [Match(client, stream) for client in set(after).difference(before)]
-            unmatched += [Match(client, stream) for client in set(before).difference(after)]
-            if not before:
-                wanted.append(stream)
-            elif not after and stream not in self.removed:
-                unwanted.append(stream)
-        return RouteChange(
-            added=tuple(sorted(self.added)),
-            removed=tuple(sorted(self.removed)),
-            matched=tuple(sorted(matched)),
-            unmatched=tuple(sorted(unmatched)),
-            wanted=tuple(wanted),
-            unwanted=tuple(unwanted),
-            denied=tuple(sorted(self.denied)),
-        )
 
 
 def type_problem(mine: TopicInfo, theirs: TopicInfo) -> str | None:

@@ -11,13 +11,14 @@ forgotten when this site wants none of the topics any more that it had here, or 
 from collections import Counter
 from collections.abc import Callable
 from enum import StrEnum
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from sern_core.topics.patterns import PatternError, PatternSet
 from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.types import ClientName, TopicName
 from sern_core.wire import framing
 from sern_core.wire.announce import MAX_ASKED
+from sern_core.wire.peer_states import PeerState, peer_states
 
 LET_GO_S: Final = 60.0
 """A peer of which the relay of a new session says nothing for so long, and that has no stream here, is forgotten."""
@@ -28,8 +29,6 @@ MAX_GIVEN_UP: Final = 64
 session."""
 MAX_ENDED: Final = 256
 """Topics of one peer that ended here while it was gone, and that are remembered."""
-MAX_FOR_S: Final = 1e9
-MAX_RTT_S: Final = 1e6
 
 
 class PeerStatus(StrEnum):
@@ -176,35 +175,26 @@ class Peers:
 
     def told(self, envelope: framing.Envelope, *, now: float) -> None:
         """The relay's `peers` message. Raises WireError for one that no honest relay sends."""
-        items = envelope.get("peers", [])
-        if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
-            raise WireError("envelope key 'peers' must be a list of maps")
-        for item in items:
-            self._told(item, now)
+        for state in peer_states(envelope):
+            self._told(state, now)
 
-    def _told(self, item: dict[str, Any], now: float) -> None:
-        name = ClientName(framing.take_str(item, "name", max_length=64))
-        if "up" not in item:  # we take nothing of it any more
-            here = framing.take_bool(item, "here") if "here" in item else None
+    def _told(self, state: PeerState, now: float) -> None:
+        name, up = state.name, state.up
+        if up is None:  # we take nothing of it any more
             self.moved.discard(name)
             if name in self._peers:
-                self._let_go(name, self._peers[name], here, now)
+                self._let_go(name, self._peers[name], state.here, now)
             return
-        up = framing.take_bool(item, "up")
-        for_s = framing.take_float(item, "for", low=0.0, high=MAX_FOR_S) or 0.0
-        rtt_s = framing.take_float(item, "rtt", low=0.0, high=MAX_RTT_S)
-        lane = framing.take_str(item, "lane", max_length=16, default="")
-        moved = framing.take_bool(item, "moved")
         if name not in self._peers and len(self._peers) >= MAX_PEERS and not self._make_way():
             raise WireError(f"the relay tells of more than {MAX_PEERS} peers")
         peer = self._known(name, now)
         if peer.up is not up:
-            peer.up, peer.up_since_s = up, now - for_s
+            peer.up, peer.up_since_s = up, now - state.for_s
         peer.lost, peer.absent, peer.absent_s, peer.given_up = not up, False, None, False
         if up:
             self._ended.pop(name, None)
-        peer.rtt_s, peer.lane = rtt_s, lane
-        if moved and not up:
+        peer.rtt_s, peer.lane = state.rtt_s, state.lane
+        if state.moved and not up:
             self.moved.add(name)
         else:
             self.moved.discard(name)

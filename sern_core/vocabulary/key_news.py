@@ -1,6 +1,9 @@
-"""What the ends of a hop tell each other of their keys, inside the session that the present ones made."""
+"""What the ends of a hop tell each other of keys, inside the session that the present ones made."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
+
+from sern_core.vocabulary.types import ClientName
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,3 +32,13 @@ class ClientKeys:
     relay: tuple[str, ...]
     kept: bool
     key: str = ""
+
+
+class KeyRevocation(NamedTuple):
+    """A client's key was revoked at a relay, at `at_s` by the wall clock, Unix seconds. `last`: with it the client lost
+    the last key that it had there."""
+
+    name: ClientName
+    key: str
+    at_s: float
+    last: bool

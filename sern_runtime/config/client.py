@@ -277,8 +277,8 @@ class ClientFile(FileModel):
     """Who this client is."""
     relays: Annotated[tuple[RelayConnection, ...], Field(min_length=1, max_length=MAX_RELAYS)] | None = None
     """In place of `relay`: several, each as that section, in the order of preference. The client is at one of them;
-    when that does not answer it goes to the next (see `failover`). Whoever is to hear of each other must go to the same
-    one: give all clients the same list."""
+    when that does not answer it goes to the next (see `failover`). Unless they form a fabric, who is to hear of each
+    other must go to the same one: give all clients the same list."""
     relay: Annotated[RelayConnection | None, Field(validate_default=True)] = None
     """The relay it connects to. Either this or `relays`."""
     failover: FailoverSection = FailoverSection()

@@ -5,10 +5,10 @@ Nothing of zenoh is imported here.
 
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 from pydantic import Field, model_validator
 
@@ -28,6 +28,9 @@ from sern_runtime.config.base import (
 )
 from sern_runtime.config.keys import secret_warning
 from sern_runtime.config.yaml import Loc
+
+if TYPE_CHECKING:
+    from cryptography import x509
 
 CA_NAME: Final = "ca"
 CA_FILE: Final = f"{CA_NAME}.pem"
@@ -104,8 +107,8 @@ class FabricSection(Section):
     """The folder with ca.pem, NAME.pem and NAME-key.pem of `sern keygen fabric`, NAME being this relay's, or a mapping
     of `ca`, `certificate` and `key`. Needed beyond loopback."""
     external: bool = False
-    """Be a client of zenoh routers of your own, in place of connections between the relays. Who may write which key is
-    theirs to check then (docs/fabric.md)."""
+    """Be a client of zenoh routers of your own, in place of connections between the relays. With `certificates`, what
+    goes between two relays is sealed, and the routers need not be believed (docs/fabric.md)."""
     lease_s: Annotated[float, Field(ge=0.5, le=60)] = LEASE_S
     """A relay of which nothing is heard for so long is gone."""
 
@@ -173,6 +176,19 @@ class FabricSection(Section):
             yield from certificate_problems(files, ("fabric", "certificates"), relay)
 
 
+def issuer(certificate: "x509.Certificate", authorities: "Sequence[x509.Certificate]") -> "x509.Certificate | None":
+    """Which of them has signed it; while the authority is replaced ca.pem holds two."""
+    from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+
+    for authority in authorities:
+        try:
+            certificate.verify_directly_issued_by(authority)
+        except (InvalidSignature, UnsupportedAlgorithm, ValueError, TypeError):
+            continue
+        return authority
+    return None
+
+
 def certificate_problems(
     files: CertificateFiles, loc: Loc, relay: str, *, at_s: float | None = None
 ) -> Iterator[FileProblem]:
@@ -191,15 +207,14 @@ def certificate_problems(
             yield FileProblem(loc, f"{path}: can not be read ({error.strerror or error}); {hint}")
     if len(contents) < 3:
         return
-    certificates: dict[Path, x509.Certificate] = {}
-    for path in (files.ca, files.certificate):
-        try:
-            certificates[path] = x509.load_pem_x509_certificate(contents[path])
-        except ValueError:
-            yield FileProblem(loc, f"{path}: is no certificate in PEM")
-    if len(certificates) < 2:
+    try:
+        path = files.ca
+        authorities = x509.load_pem_x509_certificates(contents[path])
+        path = files.certificate
+        mine = x509.load_pem_x509_certificate(contents[path])
+    except ValueError:
+        yield FileProblem(loc, f"{path}: is no certificate in PEM")
         return
-    ca, mine = certificates[files.ca], certificates[files.certificate]
     try:
         key = serialization.load_pem_private_key(contents[files.key], password=None)
     except (ValueError, TypeError):
@@ -211,11 +226,10 @@ def certificate_problems(
     if names != [relay]:
         shown = ", ".join(names) or "nobody"
         yield FileProblem(loc, f"{files.certificate} is of {shown}, and this is {relay}; use that of {relay}")
-    try:
-        mine.verify_directly_issued_by(ca)
-    except Exception:  # noqa: BLE001  (InvalidSignature, ValueError, TypeError: whatever does not fit)
+    authority = issuer(mine, authorities)
+    if authority is None:
         yield FileProblem(loc, f"{files.certificate} was not signed by {files.ca}; use those of one authority")
-    for path, certificate in certificates.items():
+    for path, certificate in ((files.ca, authority or authorities[0]), (files.certificate, mine)):
         left_s = certificate.not_valid_after_utc.timestamp() - at_s
         if left_s <= 0:
             yield FileProblem(loc, f"{path} has expired on {certificate.not_valid_after_utc:%Y-%m-%d}; make new ones")

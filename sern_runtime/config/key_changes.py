@@ -4,7 +4,7 @@ leaves keys that hold as before or as they are to, and is done again from its be
 import fcntl
 import os
 import pwd
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -130,24 +130,67 @@ def _revoke(directory: Path, name: ClientName, at_s: float) -> Revoked:
     target = None
     if keys:
         ended = tuple(replace(key, not_before_s=None, not_after_s=min(at_s, key.not_after_s or at_s)) for key in keys)
-        folder = directory / REVOKED_DIR
-        target = folder / f"{name}-{datetime.fromtimestamp(at_s, UTC):%Y%m%dT%H%M%S%fZ}{PUBLIC_SUFFIX}"
-        try:
-            folder.mkdir(mode=REVOKED_DIR_MODE, exist_ok=True)
-            sync_directory(directory)
-        except OSError as error:
-            raise ConfigError(f"can not be made: {error.strerror or error}", file=str(folder)) from error
-        # A file holds MAX_KEYS; several files of one name may hold more.
-        for start in range(0, len(ended), MAX_KEYS):
-            part = target if start == 0 else target.with_name(f"{target.stem}.{start}{PUBLIC_SUFFIX}")
-            write_public(part, PublicKeys(name, ended[start : start + MAX_KEYS]))
+        target = _write_revoked(directory, name, ended, at_s)[0]
     for file in files:
-        try:
-            file.unlink()
-            sync_directory(directory)
-        except OSError as error:
-            raise ConfigError(f"can not be removed: {error.strerror or error}", file=str(file)) from error
+        _remove(file)
     return Revoked(keys, target)
+
+
+def _write_revoked(
+    directory: Path, name: ClientName, keys: Sequence[PublicKey], at_s: float, *, suffix: str = ""
+) -> list[Path]:
+    """The files in the folder `revoked` that have these keys of a client now."""
+    folder = directory / REVOKED_DIR
+    stem = f"{name}-{datetime.fromtimestamp(at_s, UTC):%Y%m%dT%H%M%S%fZ}"
+    try:
+        folder.mkdir(mode=REVOKED_DIR_MODE, exist_ok=True)
+        sync_directory(directory)
+    except OSError as error:
+        raise ConfigError(f"can not be made: {error.strerror or error}", file=str(folder)) from error
+    written = []
+    # A file holds MAX_KEYS; several files of one name may hold more.
+    for start in range(0, len(keys), MAX_KEYS):
+        part = f".{start}" if start else ""
+        path = folder / f"{stem}{suffix}{part}{PUBLIC_SUFFIX}"
+        write_public(path, PublicKeys(name, tuple(keys[start : start + MAX_KEYS])))
+        written.append(path)
+    return written
+
+
+def _remove(file: Path) -> None:
+    try:
+        file.unlink()
+        sync_directory(file.parent)
+    except OSError as error:
+        raise ConfigError(f"can not be removed: {error.strerror or error}", file=str(file)) from error
+
+
+def keep_revoked(
+    directory: Path, revoked: Sequence[tuple[ClientName, PublicKey]], *, by: str, at_s: float
+) -> tuple[Path, ...]:
+    """Write down keys that the relay `by` revoked, into files of the folder `revoked` that have its name, and take them
+    out of the other files; each key ends when it was revoked. Returns the new files. Done before: nothing changes.
+    ConfigError where a file cannot be read or written."""
+    with _changing(directory):
+        known = {key.key for _name, key in KeyDirectory(directory).revoked()}
+        by_name: dict[ClientName, list[PublicKey]] = {}
+        for name, key in revoked:
+            if key.key not in known:
+                by_name.setdefault(name, []).append(key)
+        written = [
+            path
+            for name, keys in by_name.items()
+            for path in _write_revoked(directory, name, keys, at_s, suffix=f".told-by-{by}")
+        ]
+        gone = {key.key for _name, key in revoked}
+        for file in _files_of(directory):
+            held = load_public(file)
+            left = tuple(key for key in held.keys if key.key not in gone)
+            if not left:
+                _remove(file)
+            elif left != held.keys:
+                write_public(file, PublicKeys(held.name, left), replace=True)
+        return tuple(written)
 
 
 def add_client(directory: Path, keys: PublicKeys, *, replacing: bool, at_s: float) -> Path:

@@ -11,6 +11,7 @@ import base64
 import hashlib
 import re
 import stat
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -415,6 +416,19 @@ class KeyDirectory:
     def revoked(self) -> tuple[tuple[ClientName, PublicKey], ...]:
         """The keys that were revoked, and whose they were; each ends when it was revoked, if not before."""
         return tuple(self._revoked.values())
+
+    def revoke(self, keys: Mapping[str, tuple[ClientName, PublicKey]]) -> tuple[tuple[ClientName, PublicKey], ...]:
+        """Have these let nobody in either, which were revoked elsewhere. Returns those of them that stood here as keys
+        that are not revoked, with the names that they had here."""
+        found = []
+        for text, (name, key) in keys.items():
+            if text in self._revoked:
+                continue
+            held = self._by_key.pop(text, None)
+            self._revoked[text] = (name if held is None else held[0], key)
+            if held is not None:
+                found.append((held[0], key))
+        return tuple(found)
 
     def lapsed(self, *, at_s: float) -> tuple[str, ...]:
         """A phrase for each client of which no key holds at `at_s`."""

@@ -26,5 +26,7 @@ def register_fabric(metrics: Metrics, counters: Callable[[], FabricCounters | No
         (("sent",), read(lambda each: each.sent_bytes)), (("received",), read(lambda each: each.received_bytes)),
     ])  # fmt: skip
     metrics.counter("sern_fabric_dropped_total", "Datagrams that the fabric dropped, by reason.", ("reason",), dropped)
+    metrics.counter("sern_fabric_send_seconds_total", "The time that all sends have held the event loop.",
+                    read=lambda: [((), read(lambda each: each.send_block_s))])  # fmt: skip
     metrics.gauge("sern_fabric_send_block_max_seconds", "The longest that one send has held the event loop.",
                   read=lambda: [((), read(lambda each: each.send_block_max_s))])  # fmt: skip

@@ -75,6 +75,9 @@ class FabricDrop(StrEnum):
     NEWS_FULL = "news_full"  # more relays than are remembered
     BAD_KEY = "bad_key"  # a key or token that no relay of ours writes
     OWN_NAME = "own_name"  # of a relay that has our name
+    UNSEALED = "unsealed"  # through external routers: not sealed, or by keys that are not those of its source
+    BAD_SEAL = "bad_seal"  # altered on its way, or here a second time, or much too late
+    BAD_CARD = "bad_card"  # what is to show who a relay is does not, or came too often
 
 
 @dataclass(slots=True)

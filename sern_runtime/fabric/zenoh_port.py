@@ -4,16 +4,21 @@ zenoh calls from threads of its own. What it says there is put down and the loop
 would hold up all that the session receives (measured). They are called straight from zenoh's receiving thread: another
 thread and a queue of zenoh's in between gained no time (measured), and that queue would not be ours to bound.
 
-The session is opened and closed in a thread of ours: zenoh waits there.
+The session is opened and closed in a thread of ours: zenoh waits there. Where there are several external routers, that
+thread goes over to another one when its router is lost. Zenoh would try the lost one first, which takes `ROUTER_S` if
+that stands still.
 """
 
 import asyncio
 import json
 import logging
 from collections import deque
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from threading import Event, Lock
+from threading import Event, Lock, Thread
 from time import perf_counter
 from types import ModuleType
 from typing import Any, Final
@@ -25,7 +30,7 @@ from sern_runtime.config.endpoints import installing
 from sern_runtime.config.fabric import FabricSection
 from sern_runtime.fabric import keys
 from sern_runtime.fabric.port import FabricCounters, FabricDrop, FabricEvents, PeerRelay
-from sern_runtime.fabric.zenoh_settings import RETRY_MAX_S, FabricOptions, settings
+from sern_runtime.fabric.zenoh_settings import RETRY_FIRST_S, RETRY_MAX_S, FabricOptions, settings
 
 BATCH: Final = 200
 """Datagrams handed over in one turn of the loop: others get their turn."""
@@ -66,10 +71,18 @@ def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())[:300]
 
 
+def _report(thread: "Future[None]") -> None:
+    """An error of ours in the thread must not pass unseen."""
+    if not thread.cancelled() and (error := thread.exception()) is not None:
+        _log.error("the fabric's session is not looked after any more; restart this relay", exc_info=error)
+
+
 class ZenohPort:
     """A `FabricPort`; `events` is told. All calls on the thread of the loop that `start` ran in."""
 
-    def __init__(self, options: FabricOptions, events: FabricEvents) -> None:
+    def __init__(self, options: FabricOptions, events: FabricEvents, *, most_bytes: int = MAX_DATAGRAM_BYTES) -> None:
+        """`most_bytes`: the largest datagram that is sent."""
+        self._most_bytes = most_bytes
         self.counters = FabricCounters()
         self._zenoh = load_zenoh()
         self._options = options
@@ -78,6 +91,8 @@ class ZenohPort:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._closed = False
         self._leaving = Event()
+        self._stir = Event()  # the thread has something to do: we leave, or the router is lost
+        self._opened = 0  # sessions so far; what an earlier one tells is not believed
         self._keeps: list[Any] = []  # what zenoh undeclares when nobody has it any more
         zenoh = self._zenoh
         self._priorities = {
@@ -93,6 +108,7 @@ class ZenohPort:
         self._inbox_full = 0
         self._news: dict[str, bool] = {}
         self._news_full = 0
+        self._alive: set[str] = set()  # tokens that are there, as the session said
         self._news_lock = Lock()
         # What the loop knows.
         self._sources: dict[str, ClientName] = {}
@@ -107,9 +123,9 @@ class ZenohPort:
         """Raises ConfigError of one line."""
         self._loop = asyncio.get_running_loop()
         try:
-            config = self._config()
+            config = self._config(self._options)
             if self._options.external:
-                self._opening.submit(self._open_when_there_is_a_router, config)
+                self._opening.submit(self._stay_at_a_router).add_done_callback(_report)
             else:
                 await self._open_now(self._loop.run_in_executor(self._opening, self._open, config))
         except self._zenoh.ZError as error:
@@ -124,36 +140,93 @@ class ZenohPort:
             await self.close()
             raise
 
-    def _config(self) -> Any:
+    def _config(self, options: FabricOptions) -> Any:
         config = self._zenoh.Config()
-        for key, value in settings(self._options).items():
+        for key, value in settings(options).items():
             config.insert_json5(key, json.dumps(value))
         return config
 
-    def _open_when_there_is_a_router(self, config: Any) -> None:
+    def _stay_at_a_router(self) -> None:
         """In the thread, until `close`. What else waits for the thread, waits for the session as well."""
-        said = False
+        routers, said, pause_s = list(self._options.peers), False, RETRY_FIRST_S
         while not self._leaving.is_set():
             try:
-                self._open(config)
+                router = self._open_one_of(routers)
             except self._zenoh.ZError as error:
                 if not said:
                     said = True
-                    where = ", ".join(self._options.peers)
+                    where = ", ".join(routers)
                     _log.warning("no router of the fabric answers at %s, tried on: %s", where, _one_line(error))
-                self._leaving.wait(RETRY_MAX_S)
+                self._stir.wait(pause_s)
+                pause_s = min(2 * pause_s, RETRY_MAX_S)
             else:
-                return
+                said, pause_s = False, RETRY_FIRST_S
+                if len(routers) == 1:
+                    return  # zenoh goes back to it by itself
+                self._stir.wait()
+                if not self._leaving.is_set():
+                    _log.info("the router %s of the fabric is lost; going on to another one", router)
+                    routers.remove(router)
+                    routers.append(router)
+                    self._forget_session()
+            self._stir.clear()
+
+    def _open_one_of(self, routers: Sequence[str]) -> str:
+        """In the thread. The first that answers; ZError: the last did not either."""
+        *others, last = routers
+        for router in others:
+            try:
+                self._open_at(router)
+            except self._zenoh.ZError:
+                if self._leaving.is_set():
+                    raise
+            else:
+                return router
+        self._open_at(last)
+        return last
+
+    def _open_at(self, router: str) -> None:
+        """In the thread. Raises ZError."""
+        try:
+            self._open(self._config(replace(self._options, peers=(router,))))
+        except self._zenoh.ZError:
+            if self._session is not None:  # it answered, and was lost before all was declared
+                self._forget_session()
+            raise
+
+    def _forget_session(self) -> None:
+        """In the thread. What the session told is no longer so; it is closed beside, as zenoh may wait there."""
+        self._opened += 1
+        keeps, self._keeps = self._keeps, []
+        session, self._session = self._session, None
+
+        def close() -> None:
+            keeps.clear()
+            session.close()
+
+        Thread(target=close, name="fabric-close", daemon=True).start()
+        with self._news_lock:
+            for key in self._alive:
+                self._news.pop(key, None)
+                self._news[key] = False
+            self._alive.clear()
+        self._wake()
 
     def _open(self, config: Any) -> None:
         """In the thread. The inbox comes before the token: whoever sees that may send."""
         zenoh, options = self._zenoh, self._options
         session = self._session = zenoh.open(config)
+        self._opened += 1
         straight = zenoh.handlers.Callback
+        if options.external:
+            lost = straight(partial(self._on_router, self._opened), indirect=False)
+            self._keeps.append(session.info.declare_transport_events_listener(lost, history=False))
+            if not session.info.routers_zid():
+                self._stir.set()  # before anybody listened
         inbox = straight(self._on_datagram, indirect=False)
         self._keeps.append(session.declare_subscriber(keys.inbox(options.name), inbox))
         liveliness = session.liveliness()
-        news = straight(self._on_token, indirect=False)
+        news = straight(partial(self._on_token, self._opened), indirect=False)
         self._keeps.append(liveliness.declare_subscriber(keys.RELAY_TOKENS, news, history=True))
         self._keeps.append(liveliness.declare_token(keys.relay_token(options.itself)))
 
@@ -163,6 +236,7 @@ class ZenohPort:
             return
         self._closed = True
         self._leaving.set()
+        self._stir.set()
         if self._loop is not None:
             await self._loop.run_in_executor(self._opening, self._leave)
         self._opening.shutdown()
@@ -185,7 +259,7 @@ class ZenohPort:
             return self._drop(FabricDrop.CLOSED)
         if destination not in self._boots:
             return self._drop(FabricDrop.NO_PEER)
-        if len(datagram) > MAX_DATAGRAM_BYTES:
+        if len(datagram) > self._most_bytes:
             return self._drop(FabricDrop.TOO_LARGE)
         key = self._keys.get((destination, priority))
         zenoh = self._zenoh
@@ -230,9 +304,19 @@ class ZenohPort:
             self._inbox.append((str(sample.key_expr), data))
         self._wake()
 
-    def _on_token(self, sample: Any) -> None:
+    def _on_router(self, opened: int, event: Any) -> None:
+        if opened == self._opened and event.kind == self._zenoh.SampleKind.DELETE:
+            self._stir.set()
+
+    def _on_token(self, opened: int, sample: Any) -> None:
         key, alive = str(sample.key_expr), sample.kind == self._zenoh.SampleKind.PUT
         with self._news_lock:
+            if opened != self._opened:
+                return
+            if not alive:
+                self._alive.discard(key)
+            elif len(self._alive) < self._options.tokens:
+                self._alive.add(key)
             self._news.pop(key, None)  # to the end: news of another token may have come in between
             most = self._options.tokens * (1 if alive else 2)  # what goes has the better claim to be heard
             if len(self._news) < most:

@@ -23,8 +23,11 @@ from sern_runtime.fabric.port import PeerRelay
 RETRY_FIRST_S: Final = 0.25
 RETRY_MAX_S: Final = 4.0
 """Pauses between tries to reach a peer: each is twice the one before, within these two."""
-ROUTER_S: Final = 1.0
-"""How long one try to reach an external router takes."""
+ROUTER_S: Final = 3.0
+"""How long one try to reach an external router takes: five round trips of a satellite's 600 ms."""
+KEEP_ALIVES: Final = 3
+"""In a lease, on a connection that is idle otherwise. Nothing is lost on it, so one of them would do that is not late.
+They, coming and going, are most of what an idle fabric of 20 relays takes (measured)."""
 WAIT_BEFORE_DROP_US: Final = 1000
 """How long a put may wait, and hold the event loop, for room in a full queue. 0 loses datagrams of an idle link: a
 queue is also full while the thread that sends takes what is in it (measured: 3 of 200)."""
@@ -74,9 +77,9 @@ def settings(options: FabricOptions) -> Mapping[str, Any]:
         "listen/endpoints": [_everywhere(locator) for locator in options.listen],
         "connect/endpoints": list(options.peers),
         "listen/exit_on_failure": True,
-        # A peer may come later than we do, and go. Zenoh's client opens no session before it has its router; how often
-        # that is tried is up to `zenoh_port`.
-        "connect/timeout_ms": round(1000 * ROUTER_S) if options.external else -1,
+        # A peer may come later than we do, and go. Zenoh's client opens no session before it has its router: it tries
+        # once, and how often that is done is up to `zenoh_port`.
+        "connect/timeout_ms": 0 if options.external else -1,
         "connect/exit_on_failure": options.external,
         "connect/retry": {
             "period_init_ms": round(1000 * RETRY_FIRST_S),
@@ -87,8 +90,9 @@ def settings(options: FabricOptions) -> Mapping[str, Any]:
         "scouting/gossip/enabled": False,
         "transport/shared_memory/enabled": False,
         "transport/unicast/max_links": 1,
+        "transport/unicast/open_timeout": round(1000 * ROUTER_S) if options.external else 10_000,
         "transport/link/tx/lease": round(1000 * options.lease_s),
-        "transport/link/tx/keep_alive": 4,
+        "transport/link/tx/keep_alive": KEEP_ALIVES,
         "transport/link/tx/queue/size": dict.fromkeys(QUEUES, QUEUE_BATCHES),
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": WAIT_BEFORE_DROP_US,
         "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": WAIT_BEFORE_DROP_US,

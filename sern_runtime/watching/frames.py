@@ -21,7 +21,7 @@ MAX_EVENTS: Final = 20
 REASONS: Final = 5
 """Reasons of drops that are told of a topic."""
 STATES: Final = ("silent", "away", "connected", "unknown", "forgotten", "never")
-"""States of clients, in the order in which they are told."""
+"""States of clients, in the order in which they are told; at the end those that are at another relay."""
 Json = dict[str, Any]
 
 
@@ -35,7 +35,7 @@ def state_frame(
         "role": view.role,
         "time": view.time,
         "links_up": up,
-        "links_known": sum(line.state not in ("never", "forgotten") for line in view.links),
+        "links_known": sum(_rank(line) < STATES.index("forgotten") for line in view.links),
         "links_total": len(view.links),
         "alerts": [asdict(alert) for alert in alerts[:MAX_ALERTS]],
         "alerts_total": len(alerts),
@@ -81,8 +81,12 @@ def _thousandth(value: float | None) -> float | None:
 
 
 def _lines(lines: Iterable[LinkLine]) -> list[Json]:
-    in_order = sorted(lines, key=lambda line: (STATES.index(line.state), line.peer))
+    in_order = sorted(lines, key=lambda line: (_rank(line), line.peer))
     return [_rounded(asdict(line)) for line in in_order[:MAX_LINES]]
+
+
+def _rank(line: LinkLine) -> int:
+    return STATES.index(line.state) if line.state in STATES else len(STATES)
 
 
 def _worst(topics: Iterable[TopicLine]) -> list[TopicLine]:

@@ -54,7 +54,7 @@ class Backoff:
         if now < self.hold_until_s:
             return window
         path = self._path
-        recent = path.rate.arrived.rate() or rate
+        recent = path.rate.lately or rate
         if epochs >= 2 and path.slowdown.faster_rate is None:
             self._replace_rate(now, recent)
         self.hold_until_s = now + rtt_s

@@ -8,6 +8,7 @@ Theory of operation
     *Rate.* Bytes received between two stamps of the receiver, over a round trip and at least 120 ms; the capacity B is
     the greatest of the recent ones while there was more to send. While q stays above `hi` the link is never idle, so
     that what arrives in 120 ms is all it can do now: a link that got slower is known by then, a faster one by growth.
+    Where a burst now and again leaves the link idle in between, B is what came while one arrived.
     *Window.* The queue is W − B·RTT, so an error of q is corrected as what it is in bytes: W += γ·B·(q* − q). While
     the path looks empty the step doubles every epoch, up to a quarter of W. A queue above `hi` cuts W to what the
     receiver saw; one far above for longer than a moment does it at once (the link got slower).
@@ -204,7 +205,11 @@ class HybridWindow(CapacityEstimator):
             self._look_for_slower_link(sample)
         # Half a window and no queue: it was not the path that held us back, but our own pacing or a busy processor.
         limited = app_limited or (queue_s <= high_s and 2 * sample.inflight_bytes < self._window)
-        measured = self._rate.measure(receiver_s, cum_bytes, app_limited=limited, rtt_s=path.rtt_s or 0.0)
+        rtt_s = path.rtt_s or 0.0
+        if mode is STEADY and (app_limited or self._rate.burst is None):  # it begins or ends
+            spread_s = self._view.jitter_s
+            self._rate.note_burst(now, receiver_s, cum_bytes, app_limited=app_limited, spread_s=spread_s, rtt_s=rtt_s)
+        measured = self._rate.measure(receiver_s, cum_bytes, app_limited=limited, rtt_s=rtt_s)
         if measured is not None:
             self._note_rate(now, *measured)
         if path.epoch_s is None:
@@ -257,7 +262,8 @@ class HybridWindow(CapacityEstimator):
         rtt_s = self._path.rtt_s or 0.0
         # What was sent while draining or with nothing more to send only shows a lower bound.
         bound = span_limited or self._mode.draining or self._drain.lately(now, rtt_s)
-        self._rate.saturated = self._rate.saturated or not bound
+        if not bound:
+            self._rate.saturate()
         if self._follows:
             self._swings.at_least(now, rate)
         paced = self._pace.capped and self._view.queue_s <= self._view.target_s

@@ -1,16 +1,34 @@
 """What the link takes, by what the receiver got, and what is known of a link that got slower."""
 
 from math import inf
+from typing import Final
 
 from sern_core.path.congestion.params import HybridParams
 from sern_core.path.congestion.parts import GreatestRate, LatelyArrived
 
+BURST_BYTES: Final = 4 * 1200
+"""What comes in a shorter burst tells too little."""
+BURST_TIMES: Final = 1.03
+BURSTS: Final = 3
+"""This many bursts in a row, each `BURST_TIMES` as fast as the link was known to be, show that it is faster."""
+
 
 class LinkRate:
     """The greatest rate of late. `value` is in bytes/s: the capacity if it is `saturated`, that is if there ever was
-    more to send; else what was offered. `peak` is the greatest of the last minute or so."""
+    more to send; else how fast bursts came, or what was offered. `peak` is the greatest of the last minute or so."""
 
-    __slots__ = ("_mark", "_params", "_rates", "_span_limited", "arrived", "peak", "saturated", "value")
+    __slots__ = (
+        "_faster",
+        "_mark",
+        "_params",
+        "_rates",
+        "_span_limited",
+        "arrived",
+        "burst",
+        "peak",
+        "saturated",
+        "value",
+    )
 
     def __init__(self, params: HybridParams) -> None:
         self._params = params
@@ -25,6 +43,9 @@ class LinkRate:
         self.skip_span()
         self._span_limited = False
         self.arrived = LatelyArrived()
+        self.burst: tuple[float, int] | None = None
+        """When it began by the receiver's clock, and bytes by then; None: there is none."""
+        self._faster: list[float] = []  # rates of the latest bursts, in a row, that the link was not known to carry
 
     def skip_span(self) -> None:
         """The span of now is not measured to its end."""
@@ -58,6 +79,45 @@ class LinkRate:
         self._mark = (receiver_s, cum_bytes)
         self._span_limited = app_limited  # nothing more was there when this packet left: the next span begins idle
         return rate, limited
+
+    def note_burst(
+        self, now: float, receiver_s: float, cum_bytes: int, *, app_limited: bool, spread_s: float, rtt_s: float
+    ) -> None:
+        """One acknowledgement. A robot that sends a cloud now and again leaves the link idle in between: it carried
+        what came while one arrived, not what came in a span with the pauses. `spread_s`: by so much jitter may have
+        made a burst shorter. `app_limited`: there was nothing more to send, so the burst is over."""
+        began = self.burst
+        if not app_limited:
+            if began is None:
+                self.burst = (receiver_s, cum_bytes)
+            return
+        self.burst = None
+        if began is None or cum_bytes - began[1] < BURST_BYTES or receiver_s <= began[0]:
+            return
+        rate = (cum_bytes - began[1]) / (receiver_s - began[0] + spread_s)
+        if not self.saturated or self.value is None:
+            self.note(now, rate, rtt_s)
+        elif rate > BURST_TIMES * self.value:
+            self._faster.append(rate)
+            if len(self._faster) == BURSTS:
+                self.note(now, min(self._faster), rtt_s)
+                self._faster.clear()
+        else:
+            self._faster.clear()
+
+    @property
+    def lately(self) -> float | None:
+        """Bytes/s that the link has carried of late; where it is not known to be full, between the pauses."""
+        arrived = self.arrived.rate()
+        if self.saturated or arrived is None or self.value is None:
+            return arrived
+        return max(arrived, self.value)
+
+    def saturate(self) -> None:
+        """There is more to send than the link takes: what bursts showed is forgotten."""
+        if not self.saturated:
+            self.saturated = True
+            self._rates.clear()
 
     def note(self, now: float, rate: float, rtt_s: float) -> None:
         """The link has carried `rate`."""
