@@ -178,11 +178,53 @@ def control_messages() -> list[Vector]:
             "two clients have their latest session at this relay, the second after others elsewhere",
             {"t": "here", "clients": [["jackal1", 1], ["jackal2", 5]]},
         ),
+        _control(
+            "feeds",
+            "what this relay publishes itself has one owner",
+            {"t": "feeds", "owners": ["feed_unity"]},
+        ),
         _control("left", "a client is given up by this relay", {"t": "left", "clients": ["jackal1"]}),
+        _control(
+            "claims",
+            "one client has a name, many may write another, and of a third no client of this relay has it any more",
+            {
+                "t": "claims",
+                "topics": [
+                    ["/jackal1/odom", "jackal1", 1_790_000_000_000_000, False],
+                    ["/tf", "jackal1", 1_790_000_000_000_001, True],
+                    ["/jackal1/scan"],
+                ],
+                "whole": False,
+            },
+        ),
+        _control("offer", "a name is free that another client had", {"t": "offer", "topic": "/jackal1/odom"}),
         _control(
             "again",
             "the channel of a stream is about to begin again, from an earlier message on",
             {"t": "again", "origin": "jackal1", "boot": 7, "topic": "/jackal1/log"},
+        ),
+        _control(
+            "takes",
+            "a client begins with a stream of another relay, and is to have it from a message on",
+            {
+                "t": "takes",
+                "client": "site1",
+                "origin": "jackal1",
+                "boot": 7,
+                "topic": "/jackal1/log",
+                "next": 26,
+                "begins": True,
+            },
+        ),
+        _control(
+            "owed",
+            "a relay keeps a topic for a client of another",
+            {"t": "owed", "client": "site1", "topic": "/jackal1/log"},
+        ),
+        _control(
+            "parted",
+            "the client does not want it",
+            {"t": "parted", "client": "site1", "topic": "/jackal1/log"},
         ),
         _control(
             "go",
@@ -193,6 +235,25 @@ def control_messages() -> list[Vector]:
             "released",
             "nothing of a topic needs to be kept for the client any more",
             {"t": "released", "client": "site1", "topic": "/jackal1/log"},
+        ),
+        _control(
+            "rules",
+            "this relay has the access rules of that hash, as the other one has",
+            {"t": "rules", "hash": "4f53cda18c2baa0c0354bb5f9a3ecbe5"},
+        ),
+        _control(
+            "rules-whole",
+            "the access rules of this relay, of which the other does not say that it has the same: none, here",
+            {"t": "rules", "hash": "4f53cda18c2baa0c0354bb5f9a3ecbe5"},
+            "[]",
+        ),
+        _control(
+            "revoked",
+            "two keys were revoked at a relay, with the second the last one that jackal1 had there",
+            {
+                "t": "revoked",
+                "keys": [["jackal1", A_KEY, 1_700_000_000.0, False], ["jackal1", ANOTHER_KEY, 1_700_000_000.5, True]],
+            },
         ),
         _control(
             "lane-ask",
@@ -214,6 +275,18 @@ def control_messages() -> list[Vector]:
                 "bare": 1,
                 "since": 120,
                 "epoch": 2**63 - 1,
+            },
+        ),
+        _control(
+            "objects-relays",
+            "the first part of the objects whose values another relay wants",
+            {
+                "t": "objects",
+                "kinds": ["", "obstacle"],
+                "match": ["/jackal1/odom@.*", ".*"],
+                "since": 0,
+                "epoch": 0,
+                "more": True,
             },
         ),
         _control("objects-lost", "the relay has nothing of the client's objects", {"t": "objects_lost"}),

@@ -1,10 +1,12 @@
 """Several relay cores, each with its clients, in the virtual-time network: every two relays have a hop."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import combinations
 
 from sern_core.link.link import Link
 from sern_core.objects.feed import PERIOD_S
+from sern_core.relay.access import AccessRule, AccessTable
+from sern_core.relay.hub import HubParams
 from sern_core.vocabulary.names import is_peer, peer_name
 from sern_core.vocabulary.params import SchedulerParams
 from sern_core.vocabulary.types import ClientName
@@ -57,11 +59,20 @@ class RoamingPort:
 
 class FabricWorld(World):
     """`relays` by name. The relay of a plain world is none of them. `between`: what carries datagrams from one to
-    another."""
+    another. `rules`: the access rules of those relays that have not those of the world."""
 
-    def __init__(self, relays: Iterable[str], seed: int = 1, *, between: LinkModel | None = None) -> None:
-        super().__init__(seed)
-        self.relays = {name: SimHub(self, boot=self._boot(), name=name) for name in relays}
+    def __init__(
+        self,
+        relays: Iterable[str],
+        seed: int = 1,
+        *,
+        between: LinkModel | None = None,
+        rules: Mapping[str, Sequence[AccessRule]] | None = None,
+        hub_params: HubParams | None = None,
+    ) -> None:
+        super().__init__(seed, hub_params=hub_params)
+        self.rules = dict(rules or {})
+        self.relays = {name: self._relay(name) for name in relays}
         self.at: dict[str, str] = {}
         """The relay of each client."""
         self.roaming: dict[tuple[str, str], RoamingPort] = {}
@@ -73,9 +84,21 @@ class FabricWorld(World):
             )
         self.network.every(PERIOD_S, self._ask)
 
+    def _relay(self, name: str) -> SimHub:
+        rules = self.rules.get(name)
+        return SimHub(self, boot=self._boot(), name=name, access=None if rules is None else AccessTable(rules))
+
+    def reload(self, name: str, *rules: AccessRule) -> None:
+        """A relay reads these access rules, as soon as the world runs on."""
+        self.rules[name] = rules
+        relay = self.relays[name]
+        self.network.after(0.0, lambda _now: relay.hub.revoke(AccessTable(rules), now=relay.now), node=relay)
+
     def _ask(self, _now: float) -> None:
         for relay in self.relays.values():
             relay.hub.tell_objects(now=relay.now)
+        for client in self.clients.values():
+            client.core.objects.pump(now=client.now)
 
     def _sweep(self, now: float) -> None:
         super()._sweep(now)
@@ -85,20 +108,41 @@ class FabricWorld(World):
                 pass
 
     def client_at(
-        self, relay: str, name: str, link: LinkModel | None = None, *, patterns: Iterable[str] = ()
+        self,
+        relay: str,
+        name: str,
+        link: LinkModel | None = None,
+        *,
+        patterns: Iterable[str] = (),
+        among: Iterable[str] | None = None,
     ) -> SimClient:
-        """A client that connects to that relay now, and may move to the others."""
+        """A client that connects to that relay now, and may move to the others, or to those `among` them."""
         client = self._process(name, Clock(), SchedulerParams(), patterns)
         wire = link or LinkModel().as_stream()
         self.at[name] = relay
         client.more_ports = []
-        for other, hub in self.relays.items():
+        for other in self.relays if among is None else among:
+            hub = self.relays[other]
             port = self.roaming[name, other] = RoamingPort(client, self.at, other)
             client.more_ports.append(port)
             self.hops[f"{name}-{other}"] = self.network.join(
                 port, client, hub.port(client.name), hub, wire, wire, name=f"{name}-{other}"
             )
         return client
+
+    def rival_at(self, relay: str, name: str) -> SimClient:
+        """Another process of a client's name, which connects to that relay now, where the client never is."""
+        own = self.clients[name]
+        rival = self._process(name, Clock(), SchedulerParams(), ())
+        self.clients[name] = own
+        self.clients[f"{name}_rival"] = rival
+        hub, wire = self.relays[relay], LinkModel().as_stream()
+        port = RoamingPort(rival, {name: relay}, relay)
+        rival.more_ports = [port]
+        self.hops[f"{name}_rival"] = self.network.join(
+            port, rival, hub.port(rival.name), hub, wire, wire, name=f"{name}_rival"
+        )
+        return rival
 
     def move(self, name: str, relay: str) -> None:
         """The client goes over to another relay, as one does whose relay does not answer."""
@@ -112,10 +156,26 @@ class FabricWorld(World):
         if new.reached:
             self.clients[name].port.connected(now=now)
 
+    def restart_client(self, name: str, *, patterns: Iterable[str] | None = None) -> SimClient:
+        """kill -9 of a client: a new process in its place that knows nothing, at the same relay."""
+        old = self.clients[name]
+        new = self._process(
+            name, old.clock, SchedulerParams(), old.core.subscription.patterns if patterns is None else patterns
+        )
+        new.more_ports = []
+        pairs: list[tuple[Port, Port]] = []
+        for relay in self.relays:
+            port = RoamingPort(new, self.at, relay)
+            pairs.append((self.roaming[name, relay], port))
+            self.roaming[name, relay] = port
+            new.more_ports.append(port)
+        self.network.replace_node(old, new, pairs)
+        return new
+
     def restart(self, name: str) -> None:
         """kill -9 of a relay: a new process in its place that knows nothing."""
         old = self.relays[name]
-        new = self.relays[name] = SimHub(self, boot=self._boot(), name=name)
+        new = self.relays[name] = self._relay(name)
         pairs: list[tuple[Port, Port]] = []
         for side, port in old.sides.items():
             pairs.append((port, new.peer_port(side[1:]) if is_peer(side) else new.port(side)))
@@ -150,9 +210,10 @@ class FabricWorld(World):
         )
 
     def peers_up(self) -> bool:
-        return all(
-            relay.hub.links[peer_name(ClientName(other))].established
+        links = (
+            relay.hub.links.get(peer_name(ClientName(other)))
             for name, relay in self.relays.items()
             for other in self.relays
             if other != name
         )
+        return all(link is not None and link.established for link in links)

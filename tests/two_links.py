@@ -20,7 +20,7 @@ HELLO_KIND = bytes([framing.Kind.HELLO])
 
 
 class BareEnd:
-    """One end, and its owner: takes whatever is announced."""
+    """One end of a hop between relays, and its owner: takes whatever is announced."""
 
     def __init__(
         self, name: ClientName, peer: ClientName, *, initiator: bool, now: float, lossless: bool, any_size: bool
@@ -44,6 +44,7 @@ class BareEnd:
             now=now,
             lossless=lossless,
             any_size=any_size,
+            leased=True,
         )
         self.port = HelloPort(self.link)
 

@@ -1,13 +1,12 @@
-"""Two relays on one fabric, as processes: keys for the clients, certificates between the relays."""
+"""Relays on one fabric, as processes: keys for the clients, certificates between the relays."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from sern_core.vocabulary.types import ClientName
-from sern_tools.harness.files import relay_content, write
-from sern_tools.keygen import write_pair
-from sern_tools.keygen_fabric import make_fabric
+from sern_tools.harness.fabric import FabricFiles
+from sern_tools.harness.files import write
 from sern_tools.ports import free_ports
 from tests.daemons import HOST, Lab, Process
 
@@ -15,35 +14,31 @@ RELAYS: Final = ("relay1", "relay2")
 
 
 class TwoRelays:
-    """The files of two relays. A client is at the one of the two whose address it has."""
+    """The files of `names`, two relays or more. A client is at the one whose address it has."""
 
-    def __init__(self, lab: Lab) -> None:
+    def __init__(self, lab: Lab, names: Sequence[str] = RELAYS) -> None:
         self.lab = lab
-        make_fabric(RELAYS, out=lab.directory / "fabric")
-        fabric_port, *ports = free_ports(3)
-        self._between = f"tls/{HOST}:{fabric_port}"
-        self.endpoints = {name: f"tcp://{HOST}:{port}" for name, port in zip(RELAYS, ports, strict=True)}
-        for name in RELAYS:
-            write_pair(ClientName(name), lab.directory, lab.directory, replace=True)
+        self.names = tuple(names)
+        self.files = FabricFiles(lab.directory, names)
 
-    def relay(self, name: str, **sections: Any) -> Process:
-        (other,) = (each for each in RELAYS if each != name)
-        where = {"listen": [self._between]} if name == RELAYS[0] else {"peers": [self._between]}
-        fabric = {**where, "relays": [other], "certificates": "fabric"}
+    def relay(self, name: str, *, router: str = "", **sections: Any) -> Process:
+        """`router`: the address of an external one, in place of connections between them."""
+        if router:
+            sections["fabric"] = {"external": True, "peers": [router], "listen": []}
         said: dict[str, Any] = {"http": {"listen": f"{HOST}:{free_ports(1)[0]}"}, "summary": f"{name}.summary.json"}
-        relay = {"name": name, "secret_key_file": f"{name}.key"}
-        content = relay_content(self.endpoints[name], fabric=fabric, relay=relay, **said, **sections)
-        return self.lab.process(write(self.lab.directory, name, content))
+        return self.lab.process(self.files.relay(name, **(said | sections)))
 
-    def at(self, relay: str) -> dict[str, str]:
+    def at(self, relay: str) -> dict[str, Any]:
         """`relay` in the file of a client that is at that one."""
-        return {"endpoint": self.endpoints[relay], "server_key_file": f"{relay}.pub"}
+        return self.files.at(relay)
 
     def with_both(self, file: Path, *, first: str) -> Path:
-        """The client's file with a list of both relays, `first` the preferred one, in place of its relay."""
-        content = json.loads(file.read_text())
-        relay = content.pop("relay")
-        order = sorted(RELAYS, key=lambda name: name != first)
-        content["relays"] = [relay | self.at(name) for name in order]
-        content["failover"] = {"failover_s": 1.0, "return_s": 3600.0}
+        """The client's file with a list of all relays, `first` the preferred one, in place of its relay."""
+        order = sorted(self.names, key=lambda name: name != first)
+        return self.going(file, *order)
+
+    def going(self, file: Path, *order: str, failover_s: float = 1.0, return_s: float = 3600.0) -> Path:
+        """The client's file with a list of relays in place of its one; by default it stays where it has gone."""
+        times = {"failover_s": failover_s, "return_s": return_s}
+        content = self.files.several(json.loads(file.read_text()), order, **times)
         return write(self.lab.directory, file.stem, content)

@@ -4,7 +4,7 @@ Every node has a clock of its own (offset and rate); what is recorded here is on
 """
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from random import Random
 from typing import NamedTuple
@@ -22,7 +22,7 @@ from sern_core.stream.decoding import DecodeRequest
 from sern_core.stream.encoding import EncodeRequest
 from sern_core.stream.out_channel import OutChannel
 from sern_core.vocabulary.codec_names import DEFAULT_LOSSY, Compression, LossyParams
-from sern_core.vocabulary.key_news import ClientKeys, RelayKeys
+from sern_core.vocabulary.key_news import ClientKeys, KeyRevocation, RelayKeys
 from sern_core.vocabulary.limits import PeerLimits
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
@@ -375,16 +375,21 @@ class SimPool:
 class SimHub:
     """A relay core as a node."""
 
-    def __init__(self, world: "World", *, boot: int, name: str = "relay") -> None:
+    def __init__(self, world: "World", *, boot: int, name: str = "relay", access: AccessTable | None = None) -> None:
         self.world = world
         self.clock = world.relay_clock
         self.refusals: list[tuple[str, str]] = []
         self.client_keys: list[tuple[ClientName, ClientKeys]] = []
         self.fed: list[Message] = []
+        self.turns: list[tuple[ClientName, ClientName, bool]] = []
+        """Clients that went over from a peer, or to it."""
+        self.revoked_keys: list[tuple[ClientName, KeyRevocation]] = []
+        self.compared: list[tuple[ClientName, bool]] = []
+        """Peers, and whether they have our rules."""
         self.hub = Hub(
             name=ClientName(name),
             boot=boot,
-            access=world.access,
+            access=access or world.access,
             known=lambda _name: True,
             events=self,
             link=world.link,
@@ -425,7 +430,8 @@ class SimHub:
 
     def take_dirty(self) -> list[Port]:
         """Only these ports are asked for more after an event on another."""
-        return [*[side for port, side in self._sides if port.dirty], *self.more_ports]
+        sides = [side for port, side in self._sides if (port.link is not None or port.replies) and port.dirty]
+        return [*sides, *self.more_ports]
 
     def links(self) -> Iterator[Link]:
         yield from self.hub.links.values()
@@ -446,6 +452,15 @@ class SimHub:
     def peer_up(self, peer: ClientName) -> None: ...
 
     def peer_down(self, peer: ClientName, reason: str) -> None: ...
+
+    def went_over(self, client: ClientName, peer: ClientName, *, came: bool) -> None:
+        self.turns.append((client, peer, came))
+
+    def revoked(self, peer: ClientName, revocations: Sequence[KeyRevocation]) -> None:
+        self.revoked_keys += [(peer, each) for each in revocations]
+
+    def rules_compared(self, peer: ClientName, *, same: bool) -> None:
+        self.compared.append((peer, same))
 
     def stream_added(self, stream: StreamInfo) -> None: ...
 

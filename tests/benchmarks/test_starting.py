@@ -29,7 +29,11 @@ OF_ROS = {f"robot with ROS {kind}{part}" for kind in KINDS for part in ("", ": g
             ["--parts", "steady", "cost", "--cases", "4 Mbit/s 50 ms"],
             {"4 Mbit/s 50 ms", "one acknowledgement"},
         ),
-        *([("fabric", ["--loopback", *ROUND], {"idle loopback, TLS"})] if importlib.util.find_spec("zenoh") else []),
+        *(
+            [("fabric", ["--only", "loopback", *ROUND], {"idle loopback, TLS"})]
+            if importlib.util.find_spec("zenoh")
+            else []
+        ),
         ("footprint", ["--seconds", "0.2"], {"relay", "simulated robot", "simulated site", *OF_ROS}),
         ("relay", ["--systems", "sern", "--cases", "1 kB", *CARRYING], {"1 kB"}),
         ("robots", ["--robots", "1", *CARRYING], {"1 robots"}),

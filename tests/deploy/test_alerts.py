@@ -66,6 +66,7 @@ CASES: Final = {
     "SernAuthRefused": counter('sern_relay_auth_total{instance="i",result="unknown_key"}'),
     "SernBadFrames": counter('sern_bad_frames_total{instance="i"}'),
     "SernClockUncertain": gauge(f"sern_link_clock_error_seconds{{{LABELS}}}", "0.1", "0.9"),
+    "SernRelayPeerLost": gauge('sern_fabric_relay_up{instance="i",relay="r"}', "1", "0"),
     "SernFailover": counter('sern_client_failovers_total{instance="i",relay="r",reason="silent"}'),
     "SernReloadFailed": gauge('sern_relay_reload_failed{instance="i"}', "0", "1"),
     "SernCommandLease": counter('sern_command_lease_expired_total{instance="i"}'),

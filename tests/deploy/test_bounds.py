@@ -13,7 +13,7 @@ from sern_client.endpoints.ros1 import Ros1Options
 from sern_client.endpoints.ros1 import first_messages as ros1_first_messages
 from sern_core.link import control_stream, definitions
 from sern_core.objects.values import ObjectLimits
-from sern_core.relay import absent, access, draining, routing
+from sern_core.relay import absent, access, draining, far_objects, feed_owners, peer_objects, routing
 from sern_core.site import peers
 from sern_core.stream import decoding, drop_reports, in_stream, latched, prices
 from sern_core.vocabulary import ledger
@@ -74,6 +74,14 @@ BOUNDS: Final[dict[str, tuple[str, ...]]] = {
         f"{OBJECTS.max_objects_per_owner:,};",
         f"{nbytes(OBJECTS.max_bytes_per_owner)}, of {nbytes(OBJECTS.max_total_bytes)} in all",
     ),
+    "objects of clients of another relay": (
+        f"{far_objects.PEER_LIMITS.max_objects:,}; {nbytes(far_objects.PEER_BYTES)}; "
+        f"texts {nbytes(far_objects.PEER_LIMITS.max_texts_bytes)}; "
+        f"the registry holds {nbytes(far_objects.PEER_BYTES)} more",
+    ),
+    "values that another relay asks for": (f"{peer_objects.MAX_PEER_WANTS} kinds and patterns",),
+    "names under which another relay publishes": (f"| {feed_owners.MAX_OWNERS} |",),
+    "looks at objects of other relays": (f"| {peer_objects.MAX_LOOKS} |",),
     "large values of objects": (f"{nbytes(OBJECTS.max_held_per_owner)}, of {nbytes(OBJECTS.max_held_bytes)} in all",),
     "transforms as objects": (f"{transforms.MAX_PAIRS:,} pairs", f"{transforms.MAX_WAITING} messages"),
     "clients that are waited for": (f"{absent.MAX_ABSENT_CLIENTS:,};", f"{LIMITS.absent_topics:,} each"),

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Final
 
 import pytest
@@ -21,7 +22,8 @@ from sern_client.endpoints.unity.options import UnityOptions
 from sern_client.navigation.metrics import register_navigation
 from sern_client.navigation.node import NavigationNode
 from sern_client.navigation.options import NodeOptions
-from sern_core.vocabulary.types import DropReason, Encoding
+from sern_core.vocabulary.types import ClientName, DropReason, Encoding
+from sern_relay.fabric_metrics import register_relays
 from sern_runtime.fabric.metrics import register_fabric
 from sern_runtime.fabric.port import FabricCounters
 from sern_runtime.metrics import Metrics
@@ -81,9 +83,13 @@ def viewers() -> str:
 
 
 def fabric() -> str:
-    """What a relay says of its port to other relays."""
+    """What a relay says of its port to other relays, and of them."""
     registry = CollectorRegistry()
-    register_fabric(Metrics(registry), FabricCounters)
+    metrics = Metrics(registry)
+    register_fabric(metrics, FabricCounters)
+    other = {ClientName("hub2"): 1}
+    relays = SimpleNamespace(unknown=0, reached=lambda: other, clients=lambda: other, rules_differ=lambda: other)
+    register_relays(metrics, lambda: relays, SimpleNamespace(taken=0, unkept=0), lambda: 0)
     return generate_latest(registry).decode()
 
 

@@ -4,11 +4,14 @@ from pathlib import Path
 
 import pytest
 
-from tests.daemons import Lab, bodies, delivered, under, write_bag
+from sern_tools.keygen_fabric import add_relays
+from sern_tools.ports import free_ports
+from tests.daemons import HOST, Lab, bodies, delivered, under, write_bag
 from tests.loopback.test_services import Sites
+from tests.sern_runtime.fabric.relays import external_router, files
 from tests.two_relays import RELAYS, TwoRelays
 
-pytest.importorskip("zenoh", reason="zenoh is not installed")
+pytest.importorskip("zenoh", reason="zenoh is not installed: pip install 'sern[zenoh]'")
 
 
 async def test_a_recording_goes_from_a_robot_at_one_relay_to_a_site_at_another(tmp_path: Path) -> None:
@@ -25,6 +28,30 @@ async def test_a_recording_goes_from_a_robot_at_one_relay_to_a_site_at_another(t
         for process in (robot, site, second, first):
             await process.stop()
     assert bodies(tmp_path / "site.bag") == under("robot1", content)
+
+
+async def test_a_recording_goes_through_a_router_that_nobody_believes(tmp_path: Path) -> None:
+    """It sees datagrams of both relays, and nothing of what is in them."""
+    bag = write_bag(tmp_path / "run.bag", {"/chat": 300, "/map": 1}, latched=["/map"])
+    content = bodies(bag)
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        two = TwoRelays(lab)
+        add_relays(["router"], out=tmp_path / "fabric")
+        (port,) = free_ports(1)
+        with external_router(port, files(tmp_path / "fabric", "router")) as session:
+            seen: list[bytes] = []
+            tap = session.declare_subscriber("sern/**", lambda sample: seen.append(sample.payload.to_bytes()))
+            relays = [two.relay(name, router=f"tls/{HOST}:{port}") for name in RELAYS]
+            await relays[0].said("connected to the relay relay2")
+            site = await lab.process(lab.recorder_file("site", "/.*", relay=two.at("relay2"))).ready()
+            robot = lab.process(lab.player_file("robot1", bag, relay=two.at("relay1")))
+            await site.until(lambda: delivered(site) >= sum(map(len, content.values())), "has everything")
+            for process in (robot, site, *relays):
+                await process.stop()
+            tap.undeclare()
+    assert bodies(tmp_path / "site.bag") == under("robot1", content)
+    sizes_bytes = sum(map(len, seen))
+    assert sizes_bytes > 300 * len("/chat 300") and not any(b"chat" in each or b"robot1" in each for each in seen)
 
 
 async def test_a_relay_that_is_killed_on_the_way_costs_nothing(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 import asyncio
 import socket as socketlib
-from collections.abc import AsyncIterator, Iterable
+from collections.abc import AsyncIterator, Callable, Collection, Iterable
 from typing import cast
 
 import pytest
@@ -12,7 +12,7 @@ from sern_core.relay.hub import Hub
 from sern_core.topics.patterns import compile_pattern
 from sern_core.topics.rules import FeedRole
 from sern_core.vocabulary.types import PriorityClass, TopicName
-from sern_relay.feed import INTEREST_STREAMS, RelayFeed
+from sern_relay.feed import INTEREST_STREAMS, MOST_FAR, RelayFeed
 from sern_runtime import feed_inflow, feed_subscriptions
 from sern_runtime.feed import MAX_SUBSCRIPTION_BYTES, MAX_TOPIC_BYTES, Feed, FeedHeader, topic_frame
 from sern_runtime.feed_subscriptions import ENTRY_BYTES, Subscriptions
@@ -292,7 +292,10 @@ class Streams:
     def __init__(self, count: int) -> None:
         self.relayed = dict.fromkeys(range(count))
         self.local_owners: set[str] = set()
-        self.streams = self
+        self.streams = self.exchange = self.peers = self.far = self
+        self.topics: dict[str, int] = {}  # of other relays
+        self.on_topic: Callable[[TopicName], None] = lambda _topic: None
+        self.also: Callable[[], Collection[str]] = tuple
         self.tap: object = None
         self.told: list[list[int]] = []
 
@@ -317,3 +320,29 @@ async def test_the_origins_are_told_in_slices(zmq_context: Context) -> None:
     heard = [stream for each in hub.told for stream in each]
     assert sorted(heard[:count]) == sorted(heard[count:]) == list(range(count))
     feed.close()
+
+
+async def test_topics_of_other_relays_are_asked_for_by_name_and_very_many_by_what_the_role_may_see(
+    zmq_context: Context,
+) -> None:
+    hub = Streams(0)
+    role = FeedRole("unity", "tcp://127.0.0.1:*", subscribe=(compile_pattern("/robot/.*"),))
+    feed = RelayFeed(
+        zmq_context, cast("Hub", hub), (role,), after=lambda: None, refused=lambda *_refusal: None, clock=lambda: 0.0
+    )
+
+    async def there_are(*names: str) -> set[str]:
+        changed = {*names} ^ hub.topics.keys()
+        hub.topics = dict.fromkeys(names, 1)
+        for name in changed:
+            hub.on_topic(TopicName(name))
+        await until(lambda: feed._going_on is None, "looked at")
+        return set(hub.also())
+
+    feed.feed._outlets["unity"]._subscribed(b"/robot/a", somebody(feed.feed))
+    assert await there_are("/robot/a", "/robot/ab", "/robot/b", "/other/a") == {"/robot/a", "/robot/ab"}
+    assert await there_are(*(f"/robot/a{each}" for each in range(MOST_FAR + 1))) == {"/robot/.*"}
+    assert await there_are("/robot/a0", "/robot/b") == {"/robot/a0"}
+    assert await there_are() == set()
+    feed.close()
+    assert hub.also() == ()

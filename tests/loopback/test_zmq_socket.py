@@ -13,7 +13,15 @@ from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_runtime.config.keys import SecretKey
 from sern_runtime.zap import ZapHandler
 from sern_runtime.zmq_setup import bind_all, is_local, make_client, make_server
-from sern_runtime.zmq_socket import BATCH, VIEW_BYTES, DealerSocket, FrameSocket, RouterSocket, SendResult
+from sern_runtime.zmq_socket import (
+    BATCH,
+    LAST_WORDS_DRAINS,
+    VIEW_BYTES,
+    DealerSocket,
+    FrameSocket,
+    RouterSocket,
+    SendResult,
+)
 from tests.support import DEADLINE_S, until
 
 Context = zmq.Context[zmq.Socket[bytes]]
@@ -55,6 +63,41 @@ async def test_a_burst_arrives_whole_without_the_tick(zmq_context: Context) -> N
     assert count > 10 * BATCH
     router.close()
     dealer.close()
+
+
+async def test_what_was_sent_last_is_taken_before_the_end_of_its_connection_is_told(zmq_context: Context) -> None:
+    """A monitor may tell of the end first: here it does, as nothing is taken before."""
+    seen: list[bytes] = []
+    seen_at_end: list[bytes] = []
+    router, dealer = await pair(zmq_context, lambda _id, _user, body: seen.append(body), lambda _body: None)
+    await until(lambda: seen, "the first message")
+    monitor = router.socket.get_monitor_socket(zmq.EVENT_DISCONNECTED)
+    await numbers(dealer, 20)
+    dealer.linger_s = DEADLINE_S
+    dealer.close()
+    assert monitor.poll(int(1000 * DEADLINE_S))  # the loop stands still until the connection is over
+    assert len(seen) < 21
+    router.when_empty(lambda: seen_at_end.extend(seen))
+    await until(lambda: seen_at_end, "the end is told")
+    assert len(seen_at_end) == 21
+    router.socket.disable_monitor()
+    monitor.close()
+    router.close()
+
+
+async def test_an_end_is_told_also_where_more_and_more_comes(zmq_context: Context) -> None:
+    server = make_server(zmq_context, ["tcp://127.0.0.1:*"], None)
+    told: list[int] = []
+
+    class Endless(RouterSocket):
+        def _take(self, count: int) -> bool:
+            return True
+
+    router = Endless(server, lambda *_: None, tick_s=FAR_S)
+    router.when_empty(lambda: told.append(router.drains))
+    await until(lambda: told, "the end is told")
+    assert told == [LAST_WORDS_DRAINS]
+    router.close()
 
 
 async def test_large_messages_come_as_views_where_they_are_taken(zmq_context: Context) -> None:

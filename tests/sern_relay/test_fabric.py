@@ -15,7 +15,7 @@ from sern_tools.keygen_fabric import make_fabric
 from sern_tools.ports import free_ports
 from tests.support import until
 
-pytest.importorskip("zenoh", reason="zenoh is not installed")
+pytest.importorskip("zenoh", reason="zenoh is not installed: pip install 'sern[zenoh]'")
 
 NAMES = ("hub1", "hub2")
 
@@ -52,6 +52,25 @@ async def test_two_relays_see_each_other(tmp_path: Path) -> None:
         assert one.peers[ClientName("hub2")].rules == rules_hash(())
         await second.stop()
         await until(lambda: not one.peers)
+    finally:
+        await second.stop()
+        await first.stop()
+
+
+async def test_what_comes_from_another_relay_is_sent_on_in_the_same_turn(tmp_path: Path) -> None:
+    """Else clients waited for it until something else happened here, up to a second."""
+    make_fabric(NAMES, out=tmp_path)
+    ports = free_ports(3)
+    first, second = (relay(tmp_path, name, port, ports[2]) for name, port in zip(NAMES, ports[:2], strict=True))
+    try:
+        await first.start()
+        await second.start()
+        one = fabric_of(first)
+        await until(lambda: one.peers)
+        turns: list[str] = []
+        first.hub.after = lambda: turns.append("after")
+        one.arrived(ClientName("hub2"), bytes(20))
+        assert turns
     finally:
         await second.stop()
         await first.stop()

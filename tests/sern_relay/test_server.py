@@ -74,8 +74,15 @@ class FakeSocket:
     def __init__(self, _raw: object, received: Callable[[bytes, str, bytes], None], **_more: object) -> None:
         self.sent: list[tuple[bytes, bytes]] = []
         self.closed = False
+        self.last: list[Callable[[], None]] = []
+        """What clients said last, and the relay has not read yet."""
         self._received = received
         self._fd = 0
+
+    def when_empty(self, tell: Callable[[], None]) -> None:
+        for said in self.last:
+            said()
+        tell()
 
     def peer_details(self) -> PeerDetails:
         return PeerDetails("192.0.2.1", self._fd)
@@ -256,6 +263,18 @@ async def test_a_connection_that_is_lost_ends_here(relay: Relay) -> None:
     relay.table.open(fd)  # its number is another's now
     relay.socket.deliver(fd, ROBOT, hello(client(boot=3)))
     assert relay.users == ["site", "robot"]
+    relay.server.close()
+
+
+async def test_what_a_connection_said_last_is_read_before_it_ends(relay: Relay) -> None:
+    """The end of a connection may be heard of before its last messages are taken."""
+    fd, core = relay.session()
+    core.link.close("it goes to another relay", now=clock.now(), moved=True)
+    goodbye = core.link.next_datagram(now=clock.now())
+    assert goodbye is not None
+    relay.socket.last.append(lambda: relay.socket.deliver(fd, ROBOT, goodbye))
+    relay.table.lose(fd)
+    assert relay.users == [] and not relay.hub.links  # it is forgotten, not waited for
     relay.server.close()
 
 

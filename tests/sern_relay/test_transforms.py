@@ -43,7 +43,10 @@ class World:
     def __init__(self) -> None:
         self.now_s = 100.0
         self.registry = ObjectRegistry()
-        self.transforms = TransformObjects(self.registry, clock=lambda: self.now_s)
+        self.elsewhere: set[StreamId] = set()
+        self.transforms = TransformObjects(
+            self.registry, clock=lambda: self.now_s, elsewhere=lambda stream: stream in self.elsewhere
+        )
         self.seq = 0
 
     def send(self, to: StreamInfo, data: bytes) -> None:
@@ -213,3 +216,20 @@ async def test_a_frame_that_is_no_text_is_refused() -> None:
     await world.read("tf:a>b@jackal1")
     assert world.transforms.refused == {(JACKAL, "undecodable"): 1}
     world.transforms.close()
+
+
+async def test_streams_of_another_relay_are_read_there() -> None:
+    world = World()
+    tf, other = stream(), stream("/jackal1/other/tf")
+    world.elsewhere.add(other.id)
+    assert world.transforms.reads(tf) and not world.transforms.reads(other)
+    world.send(other, body(("map", "odom", 1.0)))
+    world.send(tf, body(("odom", "base", 1.0)))
+    await world.read("tf:odom>base@jackal1")
+    world.elsewhere.add(tf.id)  # its client has gone there
+    world.now_s += 10.0
+    world.send(tf, body(("odom", "laser", 1.0)))
+    world.elsewhere.discard(tf.id)
+    world.send(tf, body(("odom", "camera", 1.0)))
+    await world.read("tf:odom>camera@jackal1")
+    assert world.ids() == ["tf:odom>base@jackal1", "tf:odom>camera@jackal1"]

@@ -11,20 +11,27 @@ from sern_relay.refusals import Refusals
 from sern_relay.views import RelayViews
 from sern_runtime.events import EventLog
 from sern_runtime.http_routes import JsonParts
-from tests.world import World, spec
+from tests.fabric_world import FabricWorld
+from tests.world import SimHub, World, spec
 
 
 class Relay:
     """The views of a simulated relay."""
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: World, node: SimHub | None = None) -> None:
         self.events = EventLog()
         self.comings = Comings(self.events, remembered=lambda _client: True)
         self.refusals = Refusals(self.events)
-        self.hub = world.relay.hub
+        self.hub = (node or world.relay).hub
         self.admission = Admission(None)
         self.views = RelayViews(
-            "relay", self.hub, self.comings, self.refusals, self.events, self.admission, lambda _client: "192.0.2.1:4"
+            self.hub.name,
+            self.hub,
+            self.comings,
+            self.refusals,
+            self.events,
+            self.admission,
+            lambda _client: "192.0.2.1:4",
         )
 
     def pieces(self, path: str) -> list[str]:
@@ -94,3 +101,27 @@ def test_a_client_goes_through_its_states() -> None:
     assert relay.state("robot") == "away"
     relay.comings.look({}, world.now)
     assert relay.state("robot") == "forgotten"
+
+
+def test_topics_and_clients_of_other_relays_are_told_with_their_relay() -> None:
+    world = FabricWorld(["a", "b"])
+    robot = world.client_at("a", "robot")
+    world.client_at("b", "site", patterns=["/robot/odom"])
+    for number in range(300):
+        robot.publish(f"/robot/t{number}", spec())
+    robot.publish("/robot/odom", spec())
+    robot.publish("/robot/map", spec(latched=True))
+    world.run(3.0)
+    relay = Relay(world, world.relays["b"])
+    pieces = relay.pieces("/api/topics")
+    assert len(pieces) > 600 and max(map(len, pieces)) < 1000
+    told = json.loads("".join(pieces))
+    row = {"class": "state", "taken": True, "owners": ["robot"], "latched": False, "relays": ["a"]}
+    assert told["announced"] == {"/robot/odom": row}
+    assert told["elsewhere"]["/robot/t7"] == row | {"taken": False}
+    assert told["elsewhere"]["/robot/map"] == row | {"taken": False, "latched": True}
+    assert len(told["elsewhere"]) == 301
+    rows = {row["name"]: row for row in relay.answer("/api/clients")["clients"]}
+    assert (rows["robot"]["state"], rows["robot"]["relay"]) == ("at a", "a")
+    assert (rows["site"]["state"], rows["site"]["relay"]) == ("connected", "b")
+    assert "elsewhere" not in Relay(world).answer("/api/topics")

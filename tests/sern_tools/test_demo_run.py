@@ -46,12 +46,14 @@ class Started:
         self.process: asyncio.subprocess.Process | None = None
         self._reading: asyncio.Task[None] | None = None
 
-    async def start(self, *arguments: str) -> None:
+    async def start(self, *arguments: str, own_profiles: bool = True) -> None:
         self.temporary.mkdir()
-        profiles = self.directory / "profiles.yaml"
-        profiles.write_text(PROFILES)
+        if own_profiles:
+            profiles = self.directory / "profiles.yaml"
+            profiles.write_text(PROFILES)
+            arguments = ("--profiles", str(profiles), *arguments)
         environment = {**os.environ, "TMPDIR": str(self.temporary), "SERN_TEST_MARK": self.mark, "COLUMNS": "80"}
-        command = [sys.executable, "-m", "sern_tools.cli", "demo", "--profiles", str(profiles), *arguments]
+        command = [sys.executable, "-m", "sern_tools.cli", "demo", *arguments]
         self.process = await asyncio.create_subprocess_exec(
             *command,
             cwd=self.directory,

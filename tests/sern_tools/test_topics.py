@@ -87,6 +87,25 @@ def test_what_nobody_takes_is_listed_with_a_mark() -> None:
     assert "*" not in text_of(rows[:2], 120)
 
 
+def test_topics_of_all_relays_are_listed_with_the_relay_of_their_owner() -> None:
+    announced = {
+        "/r/odom": {"class": "state", "taken": True, "owners": ["r"], "relays": ["hub1"]},
+        "/tf": {"class": "state", "taken": True, "owners": ["r"], "relays": ["hub1"]},
+    }
+    elsewhere = {
+        "/s/log": {"class": "bulk", "taken": False, "owners": ["s"], "relays": ["hub2"]},
+        "/tf": {"class": "state", "taken": False, "owners": ["s"], "relays": ["hub2"]},
+    }
+    answer = relay_view(1) | {"announced": announced, "elsewhere": elsewhere}
+    rows = compare({}, parse_topics(answer), 1.0, parse_identities(OBJECTS))
+    assert [(row.topic, row.relay, row.untaken) for row in rows] == [
+        ("/r/cmd_vel", None, False), ("/r/odom", "hub1", False), ("/tf", "hub1,hub2", False), ("/s/log", "hub2", True),
+    ]  # fmt: skip
+    text = text_of(rows, 200)
+    assert "relay" in text.splitlines()[0] and "hub1,hub2" in text
+    assert "relay" not in text_of(compare({}, parse_topics(relay_view(1)), 1.0, {}), 200)
+
+
 def test_a_client_has_one_flat_table() -> None:
     topics = parse_topics({"/r/odom": sent(4), "/r/cmd_vel": arrived(3)})
     assert (topics["/r/odom"].delivered, topics["/r/cmd_vel"].received) == (4, 3)

@@ -25,6 +25,8 @@ from tests.support import until
 EXAMPLES: Final = Path(__file__).resolve().parents[3] / "deploy" / "examples"
 TWIST: Final = "geometry_msgs/msg/TwistStamped"
 SUCCEEDED, CANCELED, ABORTED = 4, 5, 6
+STEPS_LEFT: Final = [3.0, 2.0, 1.0, 0.0]
+"""What the robot's node tells of each goal."""
 PACKAGES: Final = ("nav2_msgs", "clearpath_platform_msgs", "tf2_msgs")
 
 
@@ -172,14 +174,23 @@ async def goals(scene: Scene) -> None:
     await until_fed(scene.desk, "navigate", action=scene.name("navigate_to_pose"), x=1.0)
     await scene.goal("done", 5.0)
     await scene.ends("done", SUCCEEDED)
-    left = sorted(each["left"] for each in scene.desk.of("feedback", key="done"))  # its node has several threads
-    assert left == [0.0, 1.0, 2.0, 3.0]
+    # A result may overtake the last of it, which rclpy's client then drops.
+    left = fed(scene, "done")
+    assert left and left == STEPS_LEFT[: len(left)]
     await scene.goal("behind", -5.0)
     await scene.ends("behind", ABORTED)
     await scene.goal("far", 100.0)
+    await scene.desk.event("feedback", len(STEPS_LEFT), key="far")
+    assert fed(scene, "far") == STEPS_LEFT
     await scene.desk.do("cancel", key="far")
     await scene.ends("far", CANCELED)
     assert [each["x"] for each in scene.machine.of("cancelled")] == [100.0]
+
+
+def fed(scene: Scene, key: str) -> list[float]:
+    """The steps that are left, as the feedback of a goal says; its node has several threads, and tells it in any
+    order."""
+    return sorted((each["left"] for each in scene.desk.of("feedback", key=key)), reverse=True)
 
 
 async def a_relay_that_comes_back(scene: Scene) -> None:

@@ -235,3 +235,20 @@ def test_a_hello_that_is_said_again_after_another_relay_begins_no_second_session
         port.receive(hello, now=now)
         answers.append(framing.decode_handshake(port.next_datagram(now=now) or b"")["again"])
     assert answers == [False, True, False, True]
+
+
+def test_a_session_whose_end_the_client_was_not_told_of_is_found_to_be_over() -> None:
+    """A stream loses nothing, so the client asks nothing while something of its own is under way there."""
+    world = World()
+    client = world.client("robot", LinkModel(delay_s=0.02).as_stream())
+    world.run(2.0)
+    port = inner(world, client)
+    link, receive = world.relay.hub.links[client.name], port.receive
+
+    port.receive = lambda data, *, now: link.disconnected(now=now)  # type: ignore[method-assign]
+    world.run(0.7)
+    port.receive = receive  # type: ignore[method-assign]
+    world.run(5.0)
+    assert [link.established, client.core.link.established] == [False, True], "it may be a blackout"
+    world.run(20.0)
+    assert [link.established, link.end.tag] == [True, client.core.link.end.tag]

@@ -11,6 +11,7 @@ from sern_core.path.flight import (
     REORDER_MEMORY_S,
     SACK_BITS,
     SPACED_BYTES,
+    SPARSE_ACK_DATAGRAMS,
     Arrivals,
     Flight,
 )
@@ -185,6 +186,22 @@ def test_large_datagrams_of_a_fast_stream_are_acknowledged_together() -> None:
     for number in (13, 14):  # small ones are of a link that is slow, or not known yet
         arrivals.arrived(number, 0, SPACED_BYTES - 1, now=0.0002 * 12)
     assert arrivals.due
+
+
+def test_small_datagrams_between_relays_are_acknowledged_together() -> None:
+    arrivals = Arrivals(sparse=True)
+    told = []
+    for number in range(1, 2 * SPARSE_ACK_DATAGRAMS + 1):
+        arrivals.arrived(number, 0, 100, now=0.0001 * number)
+        if arrivals.due:
+            told.append(number)
+            arrivals.flushed(0.0001 * number)
+        else:  # however many they are, none waits longer than a lone one
+            first = told[-1] + 1 if told else 1
+            assert arrivals.deadline_s() == pytest.approx(0.0001 * first + ACK_DELAY_S)
+    assert told == [SPARSE_ACK_DATAGRAMS, 2 * SPARSE_ACK_DATAGRAMS]
+    arrivals.arrived(100, 0, 100, now=0.01)
+    assert arrivals.due  # a gap, at once
 
 
 def test_no_acknowledgement_of_datagrams_that_may_be_lost_waits() -> None:

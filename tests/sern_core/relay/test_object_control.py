@@ -7,7 +7,7 @@ import pytest
 from sern_core.objects.changes import OBJECTS_TOPIC
 from sern_core.objects.registry import ObjectRegistry
 from sern_core.relay.access import AccessRule, AccessTable
-from sern_core.relay.object_exchange import name_of
+from sern_core.relay.object_rights import name_of
 from sern_core.site.object_mirror import Selection
 from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sern_core.relay.peers import MAX_EPOCH, MOVED_S
+from sern_core.relay.peers import MAX_CLIENTS, MAX_EPOCH
 from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.names import is_client_name, is_peer, peer_name
 from sern_core.vocabulary.types import ClientName, PriorityClass
@@ -27,9 +27,44 @@ def test_everybody_knows_where_a_client_is_and_the_latest_session_holds() -> Non
     world.run(1.0)
     assert [peers[name].home(ROBOT) for name in "abc"] == ["@b", None, "@b"]
     assert world.homes("robot") == ["b"]
-    now = world.relays["b"].now
-    assert peers["b"].moved(ROBOT, now) and not peers["b"].moved(ROBOT, now + MOVED_S)
-    assert not peers["c"].moved(ROBOT, now)
+
+
+def test_a_client_is_where_it_is_also_for_a_relay_that_heard_of_its_move_from_nobody() -> None:
+    """It goes from one relay to another that cannot tell the third, and that begins anew with lower epochs."""
+    world = FabricWorld(["a", "b", "c"]).watch()
+    world.client_at("c", "robot")
+    world.run(1.0)
+    world.move("robot", "b")
+    world.run(1.0)
+    homes = {name: relay.hub.peers.home for name, relay in world.relays.items()}
+    assert homes["a"](ROBOT) == "@b"
+    world.hops["a-c"].break_connection(reconnect_s=5.0)
+    world.move("robot", "c")
+    world.run(2.0)
+    assert homes["a"](ROBOT) is None and homes["b"](ROBOT) == "@c"
+    world.restart("c")
+    world.run(10.0)
+    assert homes["a"](ROBOT) == homes["b"](ROBOT) == "@c"
+    assert world.homes("robot") == ["c"]
+
+
+def test_what_a_relay_said_that_was_not_right_then_holds_when_the_other_has_left() -> None:
+    peers = FabricWorld(["a", "b", "c"]).relays["a"].hub.peers
+    b, c = peer_name("b"), peer_name("c")
+    peers.told(b, {"clients": [["robot", 2]]}, now=0.0)
+    peers.told(c, {"clients": [["robot", 1]]}, now=0.0)
+    assert peers.home(ROBOT) == b
+    peers.told_left(b, {"clients": ["robot"]}, now=0.0)
+    assert peers.home(ROBOT) == c
+    peers.told_left(c, {"clients": ["robot", "other"]}, now=0.0)
+    assert peers.home(ROBOT) is None
+    peers.came(ROBOT, now=0.0)
+    peers.came(ROBOT, now=0.0)
+    peers.told(c, {"clients": [["robot", 1]]}, now=0.0)
+    assert peers.home(ROBOT) is None
+    peers.left(ROBOT, now=0.0)
+    assert peers.home(ROBOT) == c
+    peers.validate()
 
 
 @pytest.mark.parametrize(
@@ -44,6 +79,14 @@ def test_what_no_relay_says_of_clients_ends_its_session(told: dict[str, object])
     with pytest.raises(WireError):
         peers.told(peer_name("b"), told, now=0.0)
     peers.validate()
+
+
+def test_a_relay_cannot_fill_another_with_clients_that_it_makes_up() -> None:
+    hub = FabricWorld(["a", "b"]).relays["a"].hub
+    with pytest.raises(WireError, match="more than"):
+        hub.peers.told(peer_name("b"), {"clients": [[f"c{number}", 1] for number in range(MAX_CLIENTS + 1)]}, now=0.0)
+    assert hub.peers.counts() == {peer_name("b"): MAX_CLIENTS}
+    hub.peers.validate()
 
 
 def test_a_relay_cannot_announce_streams_of_a_client_that_is_not_there() -> None:
@@ -79,3 +122,15 @@ def test_relays_ask_for_what_their_clients_want_and_no_more() -> None:
     site.subscribe("/none")
     world.run(1.0)
     assert streams() == []
+
+
+def test_a_relay_may_ask_for_as_much_as_many_clients_want() -> None:
+    world = FabricWorld(["a", "b"])
+    robot = world.client_at("a", "robot")
+    robot.publish("/robot/odom", spec(PriorityClass.STATE))
+    for number in range(4):
+        site = world.client_at("b", f"site{number}", patterns=[f"/t{number}/{each}" for each in range(2000)])
+    site.subscribe("/robot/odom", *(f"/t3/{each}" for each in range(2000)))
+    world.run(5.0)
+    assert [info.id.topic for info in site.opened] == ["/robot/odom"]
+    assert not world.relays["a"].refusals

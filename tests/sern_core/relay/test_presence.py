@@ -121,3 +121,25 @@ def test_what_many_clients_are_told_takes_many_turns() -> None:
     while presence.tell(now=1.0):
         told.append(sum(len(link.items) for link in links.values()) // MAX_TOLD)
     assert told == [4, 8] and all(len(link.items) == 2 * MAX_TOLD for link in links.values())
+
+
+def test_a_relay_is_believed_for_the_clients_that_are_at_it_and_for_no_others() -> None:
+    site = Told()
+    here, there, other = map(ClientName, ("site", "@a", "@b"))
+    links = {here: site, there: Told(), other: Told()}
+
+    def attempt(_client: ClientName, _now: float, call: Callable[[], object]) -> None:
+        call()
+
+    presence = Presence(links, set(), set(), attempt, lambda: None, PeerLimits(), home=lambda _client: there)
+    presence.joined(ClientName("robot"), here)
+    presence.watch(here, now=0.0)
+    gone: framing.Envelope = {"peers": [{"name": "robot", "up": False, "for": 3.0}]}
+    presence.told(other, gone, now=1.0)
+    assert [item["up"] for item in site.items] == [True]
+    presence.told(there, gone, now=2.0)
+    assert [(item["up"], item["for"]) for item in site.items[1:]] == [(False, 3.0)]
+    for untrue in ({"name": "robot", "up": True}, {"name": "robot", "here": True}):
+        presence.told(other, {"peers": [untrue]}, now=3.0)
+    presence.sweep(now=4.0)
+    assert [item["up"] for item in site.items] == [True, False]

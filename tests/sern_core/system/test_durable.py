@@ -10,7 +10,7 @@ from sern_core.vocabulary.errors import UsageError
 from sern_core.vocabulary.message import TopicSpec
 from sern_core.vocabulary.types import PriorityClass, Reliability
 from sern_sim.models import LinkModel, Window
-from tests.exploring import cases
+from tests.exploring import seeds
 from tests.sern_core.system.durable_world import DurableRelay, DurableRobot, SimDisk
 from tests.world import World
 
@@ -74,7 +74,7 @@ class Play:
         assert len(got) > 10
 
 
-@pytest.mark.parametrize("seed", range(cases(25)))
+@pytest.mark.parametrize("seed", seeds(25))
 @pytest.mark.parametrize("relay_disk", [True, False])
 def test_what_was_acknowledged_arrives_once_whatever_dies(seed: int, relay_disk: bool) -> None:
     play = Play(seed, relay_disk=relay_disk)

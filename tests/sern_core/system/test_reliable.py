@@ -294,6 +294,22 @@ def test_latched_state_outlives_restarts(reliable: bool, restarted: str) -> None
     assert site.seqs("/robot/map")[-2:] == [4, 5] and len(site.seqs("/robot/map")) == len(set(site.seqs("/robot/map")))
 
 
+def test_latched_state_is_there_again_when_its_stream_ended_and_begins_anew() -> None:
+    """With the stream ended the publisher on the robot's far side, and what it would have told whoever comes late."""
+    world = World().watch()
+    robot = world.client("robot")
+    site = world.client("site", patterns=["/.*"])
+    world.run(1.0)
+    for name, latched in (("/tf_static", True), ("/log", False)):
+        robot.send(robot.publish(name, spec(PriorityClass.STATE, reliable=True, latched=latched)), name.encode())
+    world.run(1.0)
+    assert sorted(got.body for got in site.got) == [b"/log", b"/tf_static"]
+    world.relay.hub.forget(site.core.name, "another process has its name", now=world.relay.now)
+    world.run(5.0)
+    assert sorted(stream.id.topic for stream in site.closed) == ["/log", "/tf_static"]
+    assert [got.body for got in site.got[2:]] == [b"/tf_static"], "what is latched, and nothing twice"
+
+
 def test_a_replay_does_not_delay_live_traffic() -> None:
     world = World().watch()
     robot = world.client("robot")

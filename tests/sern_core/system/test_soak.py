@@ -31,6 +31,7 @@ STATIC = frozenset(
         ".routing._access._grants[][]._exact",
         ".objects._deletions",  # a ring
         ".link.lanes.clock._stepped",  # a ring
+        ".link.taking._had",  # where reliable streams ended: at most MAX_REMEMBERED
         ".exchange.counts",  # outcomes, of which there are eight
         ".objects.registry._deletions",  # of a client's own
         ".presence._watchers[].missing",  # those that a client shows as gone, in its session: at most MAX_ASKED

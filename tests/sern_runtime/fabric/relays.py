@@ -9,8 +9,8 @@ from typing import Any
 
 from sern_core.vocabulary.types import ClientName
 from sern_runtime.config.fabric import CA_FILE, CertificateFiles, certificate_file, key_file
-from sern_runtime.fabric.port import PeerRelay
-from sern_runtime.fabric.zenoh_port import ZenohPort
+from sern_runtime.fabric.port import FabricPort, PeerRelay
+from sern_runtime.fabric.sealed_port import port_of
 from sern_runtime.fabric.zenoh_settings import FabricOptions
 from sern_tools.ports import free_ports
 from tests.support import DEADLINE_S
@@ -65,7 +65,7 @@ class Relay:
 
     def __init__(self, options: FabricOptions) -> None:
         self.told = Told()
-        self.port = ZenohPort(options, self.told)
+        self.port: FabricPort = port_of(options, self.told)
         self.name = options.name
 
     async def until(self, condition: Callable[[], object]) -> None:
@@ -187,17 +187,29 @@ async def between(port: int) -> AsyncIterator[Wire]:
 
 
 @contextmanager
-def external_router(port: int) -> Iterator[None]:
-    """A zenoh router that is none of ours."""
+def external_router(
+    port: int, certificates: CertificateFiles | None = None, *, beside: int | None = None
+) -> Iterator[Any]:
+    """A zenoh router that is none of ours, and its session, which may do what a router can. It connects to the one at
+    the port `beside`."""
     import zenoh
 
-    config = zenoh.Config()
-    for key, value in {
+    told: dict[str, Any] = {
         "mode": "router",
-        "listen/endpoints": [f"tcp/127.0.0.1:{port}"],
+        "listen/endpoints": [f"{'tcp' if certificates is None else 'tls'}/127.0.0.1:{port}"],
+        "connect/endpoints": [] if beside is None else [f"tcp/127.0.0.1:{beside}"],
         "scouting/multicast/enabled": False,
         "transport/shared_memory/enabled": False,
-    }.items():
+    }
+    if certificates is not None:
+        told["transport/link/tls"] = {
+            "root_ca_certificate": str(certificates.ca),
+            "listen_certificate": str(certificates.certificate),
+            "listen_private_key": str(certificates.key),
+            "enable_mtls": True,
+        }
+    config = zenoh.Config()
+    for key, value in told.items():
         config.insert_json5(key, json.dumps(value))
-    with zenoh.open(config):
-        yield
+    with zenoh.open(config) as session:
+        yield session

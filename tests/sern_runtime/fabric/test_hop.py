@@ -14,7 +14,7 @@ from tests.sern_runtime.fabric.relays import Told, chain, running
 from tests.support import until
 from tests.two_links import BareEnd, pair
 
-pytest.importorskip("zenoh", reason="zenoh is not installed")
+pytest.importorskip("zenoh", reason="zenoh is not installed: pip install 'sern[zenoh]'")
 
 RELIABLE = TopicSpec(PriorityClass.STATE, reliability=Reliability.RELIABLE, depth=200, lifespan_s=None)
 COMMANDS = TopicSpec(PriorityClass.CONTROL, reliability=Reliability.RELIABLE, depth=200, lifespan_s=None)

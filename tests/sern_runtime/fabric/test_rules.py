@@ -18,7 +18,7 @@ from sern_tools.ports import free_ports
 from tests.sern_runtime.fabric.relays import BOOT, A, B, C, files, options, running
 from tests.support import until
 
-zenoh = pytest.importorskip("zenoh", reason="zenoh is not installed")
+zenoh = pytest.importorskip("zenoh", reason="zenoh is not installed: pip install 'sern[zenoh]'")
 
 
 @contextmanager

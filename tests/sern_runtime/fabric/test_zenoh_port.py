@@ -1,6 +1,7 @@
 """Two and three relays over zenoh on loopback: who is there, what arrives and from whom, and what is dropped."""
 
 import asyncio
+import logging
 import sys
 from contextlib import suppress
 from functools import partial
@@ -30,7 +31,7 @@ from tests.sern_runtime.fabric.relays import (
     running,
 )
 
-pytest.importorskip("zenoh", reason="zenoh is not installed")
+pytest.importorskip("zenoh", reason="zenoh is not installed: pip install 'sern[zenoh]'")
 
 AGAIN_S = 1.0
 LEASE_S = 0.5
@@ -196,6 +197,24 @@ async def test_relays_at_a_router_of_somebody_else() -> None:
             await meet(a, b)
             await send_until(a, b, b"through the router", PriorityClass.STATE)
         await a.until(lambda: not a.told.peers)
+
+
+async def test_a_router_that_stands_still_is_left_for_another_one(caplog: pytest.LogCaptureFixture) -> None:
+    """It is not tried again first, which would take as long as one that is far away may take."""
+    caplog.set_level(logging.INFO)
+    first, second = free_ports(2)
+    with external_router(first), external_router(second, beside=first):
+        async with between(first) as wire:
+            at_first = options(A, connect=[wire.port, second], external=True, lease_s=LEASE_S)
+            async with running(at_first, options(B, connect=[second], external=True)) as (a, b):
+                await meet(a, b)
+                wire.close_door(cut=False)
+                await a.until(lambda: ("down", (B, BOOT)) in a.told.news and B in a.told.peers)
+                await send_until(a, b, b"at the second", PriorityClass.CONTROL)
+                await a.port.close()
+                await b.until(lambda: not b.told.peers)
+                wire.open_door()
+    assert caplog.text.count("is lost; going on to another one") == 1
 
 
 async def test_leaving_while_no_router_answers() -> None:

@@ -119,6 +119,7 @@ async def test_what_is_live_needs_the_token_in_a_header() -> None:
 async def test_frames_tell_of_everything_and_names_are_text() -> None:
     told = fleet(2, 3)
     told.clients_told.append(client_row("rover", "away", why="it is off"))
+    told.clients_told.append(client_row("far", "at hub2", since_s=None, heard_s=None))
     told.topics_told[HOSTILE] = ("robot0", received_row(4, dropped={"lost": 3}))
     told.kinds = ["topic", "topic", "robot"]
     configuration = {"rates": {"bulk": 0.5}, "codec": "none", "redundancy": 0, "summaries": None}
@@ -130,8 +131,8 @@ async def test_frames_tell_of_everything_and_names_are_text() -> None:
             assert name == "links" and pictures["left_out"] == 0
             seen = await state(answer.content)
         assert {row["topic"] for row in seen["topics"]} == set(told.topics_told)
-        assert (seen["links_up"], seen["links_known"], seen["links_total"]) == (2, 3, 3)
-        assert [row["peer"] for row in seen["links"]] == ["rover", "robot0", "robot1"]
+        assert (seen["links_up"], seen["links_known"], seen["links_total"]) == (2, 3, 4)
+        assert [row["peer"] for row in seen["links"]] == ["rover", "robot0", "robot1", "far"]
         assert seen["alerts"][0]["text"] == "rover is gone for 12 s: it is off"
         assert seen["objects"] == {"topic": 2, "robot": 1}
         assert seen["events"][-1]["text"] == "robot0 came"
