@@ -10,7 +10,7 @@ PACKAGES := sern_core sern_runtime sern_relay sern_client sern_sim sern_twin ser
 # quarter less of CPU, and each worker of the tests would rewrite all of them anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup lint format types test wheel compiled test-compiled deb image test-install arm-wheels explore standstills soak fuzz kills lab bench performance endpoints operations figures cellular navigation picture demo demo-twin demo-navigation schemas clean
+.PHONY: help setup lint format types test wheel compiled test-compiled deb image test-install arm-wheels explore standstills soak fuzz kills lab bench performance endpoints operations figures cellular navigation paper paper-quick picture demo demo-twin demo-navigation schemas clean
 
 help:
 	@echo "make setup    create $(VENV) with pinned dependencies"
@@ -33,6 +33,8 @@ help:
 	@echo "make operations   the tables of keys and of durable topics, 10 minutes"
 	@echo "make cellular RECORDINGS=DIR   the table of recorded cellular links, a minute; virtual time"
 	@echo "make navigation   the tables of navigation and perception, hours; DRIVES=FILE keeps the drives, and goes on with them"
+	@echo "make paper    as root: the tables, figures and claims of the paper, in paper-out, hours; it goes on where it was interrupted"
+	@echo "make paper-quick   the same from few runs of each, a quarter of an hour"
 	@echo "make picture  the demo, and its picture for README.md"
 	@echo "make bench    the quick benchmarks;  make schemas: regenerate schemas/ and the configuration reference"
 
@@ -187,6 +189,14 @@ navigation: setup
 	$(BIN)/python -m benchmarks.navigation --resume $(DRIVES) --json build/navigation.json
 	$(BIN)/python -m benchmarks.perception --json build/perception.json
 	$(BIN)/python -m benchmarks.document build/navigation.json build/perception.json
+
+# The tables, figures and claims of the paper, in paper-out: hours, as root where the lab is to be had; it goes on
+# where it was interrupted. paper-quick: a quarter of an hour.
+paper: setup
+	$(BIN)/python -m benchmarks.paper
+
+paper-quick: setup
+	$(BIN)/python -m benchmarks.paper --quick
 
 picture: setup
 	$(BIN)/sern demo --out build/demo --picture docs/images/demo.png

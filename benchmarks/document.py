@@ -123,6 +123,10 @@ TITLES: Final = {
     "counted_refused": "scans that did not fit",
     "flags_hour": "an hour",
     "driven_hours": "hours driven",
+    "converged_s": "sessions of every two, s after the last was ready",
+    "from_start_s": "s after the first was started",
+    "crossing_percent": "cross, %",
+    "crossing_p99_ms": "control that crosses, p99, ms",
 }
 """Titles of columns whose metric's name does not say it well."""
 PURE: Final = "1"

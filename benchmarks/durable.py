@@ -23,13 +23,13 @@ import statistics
 import subprocess
 import sys
 import tempfile
-import urllib.request
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 from benchmarks import common
+from benchmarks.asking import count, ready
 from benchmarks.child import environment
 from sern_client.endpoints.bag_files import BagFile
 from sern_core.vocabulary.errors import SernError
@@ -70,16 +70,6 @@ def _bag(path: Path, count: int) -> Path:
         file.write(info, 10**18 + number * 1000, len(text).to_bytes(4, "little") + text)
     file.finish()
     return path
-
-
-def _count(http: str, name: str) -> float:
-    """A metric, over all its labels; 0 before the daemon answers."""
-    try:
-        with urllib.request.urlopen(f"http://{http}/metrics", timeout=5.0) as answer:
-            lines = answer.read().decode().splitlines()
-    except OSError:
-        return 0.0
-    return sum(float(line.split()[-1]) for line in lines if line.startswith((f"{name} ", f"{name}{{")))
 
 
 async def _rate(read: Callable[[], float], seconds: float, children: Children) -> float:
@@ -127,7 +117,7 @@ async def _daemons(folder: Path, seconds: float, *, counted: str) -> float:
         away = await children.start("site", daemon("client", folder / "site1.yaml"), environment=environment())
 
         async def connected() -> bool:
-            return await asyncio.to_thread(_ready, https[2])
+            return await asyncio.to_thread(ready, https[2])
 
         await children.until(connected, START_S, "the site is not connected")
         await asyncio.sleep(SETTLE_S)
@@ -136,15 +126,7 @@ async def _daemons(folder: Path, seconds: float, *, counted: str) -> float:
         await children.start("robot", daemon("client", folder / "robot1.yaml"), environment=environment())
         where = https[1] if counted == "robot" else https[0]
         name = "sern_received_messages_total" if counted == "memory" else "sern_durable_stored_total"
-        return await _rate(partial(_count, where, name), seconds, children)
-
-
-def _ready(http: str) -> bool:
-    try:
-        with urllib.request.urlopen(f"http://{http}/readyz", timeout=5.0) as answer:
-            return bool(answer.status == 200)
-    except OSError:
-        return False
+        return await _rate(partial(count, where, name), seconds, children)
 
 
 async def _store(folder: Path, seconds: float) -> float:

@@ -28,6 +28,7 @@ from sern_runtime.config.keys import SecretKey, load_public, load_secret
 from sern_runtime.config.relay import load_relay
 from sern_runtime.config.shared import LinkSection
 from sern_runtime.loop import Shutdown, run
+from sern_tools.harness.files import RELAY
 
 
 class IdleSite:
@@ -128,8 +129,9 @@ class Member(IdleSite):
         name: ClientName,
         *,
         udp: bool,
+        relay: str = RELAY,
     ) -> None:
-        """Its keys and the relay's are in `folder`. `udp`: whether it asks for the datagram lane."""
+        """Its keys and those of `relay` are in `folder`. `udp`: whether it asks for the datagram lane."""
         link = LinkSection()
         section = RelayConnection(endpoint=address, server_key_file="-", secret_key_file="-", udp=udp)
         self.core = ClientCore(
@@ -141,7 +143,7 @@ class Member(IdleSite):
             now=clock.now(),
         )
         self.connection = Connection(self.core, section, link, on_down=lambda _reason: None)
-        valid = load_public(folder / "relay.pub").valid_at(time.time())
+        valid = load_public(folder / f"{relay}.pub").valid_at(time.time())
         self.connection.open(context, load_secret(folder / f"{name}.key"), [key.key for key in valid])
 
     @property

@@ -306,7 +306,7 @@ def _runner(lab: Lab, directory: Path, duration_s: int) -> Callable[[AdaptationS
 
 def measure(options: argparse.Namespace, report: Report) -> None:
     note = try_realtime()  # all that is started inherits the priority
-    duration_s = QUICK_S if options.quick else RUN_S
+    duration_s = options.seconds or (QUICK_S if options.quick else RUN_S)
     with tempfile.TemporaryDirectory(prefix="sern-mmcf-") as temporary, Lab() as lab:
         directory = Path(temporary)
         if options.traces is not None:
@@ -320,6 +320,7 @@ def measure(options: argparse.Namespace, report: Report) -> None:
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--runs", type=positive, default=1, metavar="N", help="of each policy, in mixed order")
+    parser.add_argument("--seconds", type=positive, metavar="N", help=f"of a run, in place of {RUN_S}")
     parser.add_argument("--traces", type=Path, metavar="DIR", help="keep logs and /api/mmcf in a new folder there")
 
 

@@ -106,6 +106,15 @@ def scans(data: Path = DATA) -> list[NDArray[np.float32]]:
     return list(islice(_made_scans(), len(SCANS)))
 
 
+def points(nbytes: int, data: Path = DATA) -> bytes:
+    """About so many bytes of a scan's points, evenly thinned, or of several scans: x y z intensity as float32."""
+    scan = scans(data)[0]
+    wanted = max(1, nbytes // scan[0].nbytes)
+    if wanted <= len(scan):
+        return bytes(scan[:: len(scan) // wanted][:wanted].tobytes())
+    return bytes(scan.tobytes() * (wanted // len(scan) + 1))[: wanted * scan[0].nbytes]
+
+
 def _made_scans() -> Iterator[NDArray[np.float32]]:
     """What a robot that drives on sees every two seconds, without the rays that met nothing."""
     robot = SimulatedJackal(Random(1), patrol=True)

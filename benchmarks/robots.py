@@ -13,15 +13,11 @@ A robot sends 56 messages a second: 2 topics of class control (100 B, 20 and 10 
 
 import argparse
 import asyncio
-import heapq
 import multiprocessing
-import random
-import struct
 import sys
 import tempfile
 from array import array
-from collections.abc import AsyncIterator, Sequence
-from contextlib import asynccontextmanager
+from collections.abc import Callable, Sequence
 from ctypes import c_bool, c_uint64
 from functools import partial
 from multiprocessing.sharedctypes import RawArray, RawValue
@@ -34,13 +30,12 @@ import zmq
 
 from benchmarks import common
 from benchmarks.child import Worker, await_workers
+from benchmarks.fleet import STAMP, Kind, looked_after, offer, rate_hz_of, topics_of
 from benchmarks.loopback import Member, running, serve, watch
 from sern_core.path.lanes import LANE_NAMES, LANE_UDP, LANE_ZMQ
-from sern_core.site.client import ClientCore
-from sern_core.stream.out_channel import OutChannel
 from sern_core.vocabulary.errors import SernError
-from sern_core.vocabulary.message import Message, StreamInfo, TopicInfo, TopicSpec
-from sern_core.vocabulary.types import CLASS_LABELS, ClientName, Encoding, PriorityClass, TopicName
+from sern_core.vocabulary.message import Message, StreamInfo
+from sern_core.vocabulary.types import CLASS_LABELS, ClientName, PriorityClass
 from sern_runtime import clock
 from sern_tools.harness.files import relay_content, write
 from sern_tools.keygen import make_keys
@@ -51,22 +46,10 @@ HOSTS: Final = 2
 """Processes that the robots are spread over."""
 START_S: Final = 60.0
 UDP, ZMQ = LANE_NAMES[LANE_UDP], LANE_NAMES[LANE_ZMQ]
-LOOK_S: Final = 0.5
-"""How often a client looks after its connections, and says whether its data takes the lane that it should."""
-STAMP: Final = struct.Struct("!d")
 PROMPT_ROBOTS: Final = 50
 LATENCY_LIMIT_MS: Final = 10.0
 """The limit holds for so many robots; the cores of a small machine are full with more."""
 CPU_RATIO_LIMIT: Final = 1.2
-
-
-class Kind(NamedTuple):
-    """Some topics of a robot."""
-
-    priority: PriorityClass
-    topics: int
-    nbytes: int
-    rate_hz: float
 
 
 ROBOT: Final = (
@@ -75,8 +58,8 @@ ROBOT: Final = (
     Kind(PriorityClass.STATE, 8, 300, 2.0),
     Kind(PriorityClass.BULK, 10, 1000, 1.0),
 )
-TOPICS: Final = sum(kind.topics for kind in ROBOT)
-RATE_HZ: Final = sum(kind.topics * kind.rate_hz for kind in ROBOT)
+TOPICS: Final = topics_of(ROBOT)
+RATE_HZ: Final = rate_hz_of(ROBOT)
 
 
 class Shared:
@@ -110,24 +93,13 @@ def robot_name(number: int) -> ClientName:
     return ClientName(f"robot{number}")
 
 
-@asynccontextmanager
-async def _members(shared: Shared, process: int, members: Sequence[Member]) -> AsyncIterator[None]:
-    """Looks after clients that are connected, and says how many of them are as they are to be measured."""
+def _say(shared: Shared, process: int, members: Sequence[Member]) -> Callable[[], None]:
+    """Says how many of these clients are as they are to be measured."""
 
-    async def tick() -> None:
-        while True:
-            for member in members:
-                member.connection.tick()
-            shared.ready[process] = sum(member.lane == shared.lane for member in members)
-            await asyncio.sleep(LOOK_S)
+    def say() -> None:
+        shared.ready[process] = sum(member.lane == shared.lane for member in members)
 
-    ticks = asyncio.create_task(tick())
-    try:
-        yield
-    finally:
-        ticks.cancel()
-        for member in members:
-            member.connection.close()
+    return say
 
 
 class _Site(Member):
@@ -151,7 +123,7 @@ def _site(folder: Path, address: str, shared: Shared, result: Any) -> None:
         with zmq.Context() as context:
             site = _Site(context, folder, address, shared)
             site.core.subscribe((".*",), now=clock.now())
-            async with _members(shared, HOSTS, [site]):
+            async with looked_after([site], _say(shared, HOSTS, [site])):
                 while not shared.stopped.value:  # noqa: ASYNC110  (a flag in shared memory has no event)
                     await asyncio.sleep(0.02)
         result.send({label: np.array(ages_s) for label, ages_s in site.ages_s.items()})
@@ -160,37 +132,14 @@ def _site(folder: Path, address: str, shared: Shared, result: Any) -> None:
         runner.run(main())
 
 
-def _offer(core: ClientCore) -> list[tuple[OutChannel, Kind]]:
-    channels: list[tuple[OutChannel, Kind]] = []
-    for kind in ROBOT:
-        for _ in range(kind.topics):
-            info = TopicInfo(TopicName(f"/{core.name}/topic{len(channels)}"), "bench/Bytes", Encoding.RAW)
-            channels.append((core.publish(info, TopicSpec(priority=kind.priority), now=clock.now()), kind))
-    return channels
-
-
 def _robots(folder: Path, address: str, numbers: range, process: int, shared: Shared) -> None:
     async def main() -> None:
-        rng = random.Random(numbers.start)
         with zmq.Context() as context:
             members = [
                 Member(context, folder, address, robot_name(number), udp=shared.lane == UDP) for number in numbers
             ]
-            due: list[tuple[float, int, Member, OutChannel, Kind]] = []
-            for member in members:
-                for channel, kind in _offer(member.core):
-                    due.append((clock.now() + rng.random() / kind.rate_hz, len(due), member, channel, kind))
-            heapq.heapify(due)
-            async with _members(shared, process, members):
-                while not shared.stopped.value:
-                    now = clock.now()
-                    while due[0][0] <= now:
-                        due_s, order, member, channel, kind = due[0]
-                        body = STAMP.pack(clock.now()).ljust(kind.nbytes, b"\0")
-                        member.core.send(channel, body, 0, now=now)
-                        member.connection.wake()
-                        heapq.heapreplace(due, (due_s + 1.0 / kind.rate_hz, order, member, channel, kind))
-                    await asyncio.sleep(min(0.02, max(0.0, due[0][0] - clock.now())))
+            async with looked_after(members, _say(shared, process, members)):
+                await offer(members, ROBOT, numbers.start, lambda: bool(shared.stopped.value))
 
     with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
         runner.run(main())

@@ -11,7 +11,6 @@ import signal
 import statistics
 import sys
 import tempfile
-import urllib.request
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import count
@@ -19,6 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from benchmarks import common
+from benchmarks.asking import get, ready
 from benchmarks.child import environment
 from sern_runtime import clock
 from sern_tools.harness.files import client_content, relay_content, write
@@ -95,10 +95,10 @@ class Soak:
             command = daemon(program, self._folder / f"{name}.yaml")
             watched.append(Watched(await self._children.start(name, command, environment=environment())))
 
-        async def ready() -> bool:
-            return await asyncio.to_thread(lambda: all(_get(f"http://{listen}/readyz") for listen in self._https))
+        async def all_ready() -> bool:
+            return await asyncio.to_thread(lambda: all(map(ready, self._https)))
 
-        await self._children.until(ready, START_S, "the three that stay are not connected")
+        await self._children.until(all_ready, START_S, "the three that stay are not connected")
         return watched
 
     async def come_and_go(self) -> None:
@@ -132,17 +132,8 @@ class Soak:
         while True:
             for listen in self._https:
                 for path in PATHS:
-                    await asyncio.to_thread(_get, f"http://{listen}{path}")
+                    await asyncio.to_thread(get, listen, path)
             await asyncio.sleep(2.0)
-
-
-def _get(address: str) -> bytes:
-    """The answer; empty while there is none."""
-    try:
-        with urllib.request.urlopen(address, timeout=5.0) as answer:
-            return bytes(answer.read())
-    except OSError:
-        return b""
 
 
 async def _soak(folder: Path, seconds: float) -> tuple[list[Watched], int]:

@@ -96,10 +96,11 @@ class Ros:
         environment = {**self.environment(""), **child.environment()}
         return await self.children.start(role, command, talks=True, environment=environment)
 
-    async def rospy(self, role: str, master: str, *arguments: str) -> Child:
-        """A process of `rospy_roles`, which is ready."""
+    async def rospy(self, role: str, master: str, *arguments: str, typed: bool = True) -> Child:
+        """A process of `rospy_roles`, which is ready; `typed`: it is told the topics of this benchmark."""
         environment = {**self.environment(master), "PYTHONPATH": str(child.ROOT)}
-        command = [DEBIAN_PYTHON, "-m", "benchmarks.endpoints.rospy_roles", role, *arguments, *_TOPICS]
+        topics = _TOPICS if typed else []
+        command = [DEBIAN_PYTHON, "-m", "benchmarks.endpoints.rospy_roles", role, *arguments, *topics]
         process = await self.children.start(f"rospy-{role}", command, talks=True, environment=environment)
         await self.children.within(said(process, "ready"), START_S, f"rospy-{role} was not ready")
         return process

@@ -1,1 +1,1 @@
-"""Two relays' ends of a fabric, before there are relays on it: see `__main__`."""
+"""Several relays, and two of their ends before there are relays on them: see `__main__`."""

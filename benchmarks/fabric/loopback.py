@@ -1,5 +1,6 @@
 """How long a datagram takes through two ports on an idle loopback, with certificates, and what it costs both ends."""
 
+import argparse
 import asyncio
 import tempfile
 import time
@@ -13,7 +14,7 @@ from typing import Final
 import uvloop
 
 from benchmarks.child import Worker
-from benchmarks.common import Report, interleaved, medians, percentile
+from benchmarks.common import Report, interleaved, medians, percentile, repetitions
 from benchmarks.fabric.hop_end import ROBOT, SITE, certificates
 from sern_core.vocabulary.types import ClientName, PriorityClass
 from sern_runtime.config.fabric import CA_FILE, CertificateFiles, certificate_file, key_file
@@ -116,7 +117,8 @@ def measure(size: int, rate_hz: float, duration_s: float) -> dict[str, float]:
     }
 
 
-def bench(report: Report, rounds: int, duration_s: float) -> None:
+def bench(options: argparse.Namespace, report: Report) -> None:
+    rounds, duration_s = repetitions(options, usual=(3, 10.0), quick=(1, 2.0))
     cases = {name: partial(measure, size, rate_hz, duration_s) for name, (size, rate_hz) in CASES.items()}
     for name, rows in interleaved(cases, rounds).items():
         report.row("idle loopback, TLS", name, **medians(rows))

@@ -1,0 +1,110 @@
+"""Writes the report: one page of HTML that needs nothing beside it, and the same as PDF."""
+
+import base64
+import io
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import psutil
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from benchmarks.common import pyplot
+from benchmarks.paper import errata
+from benchmarks.paper.claims import Figures, claims
+from benchmarks.paper.running import Result
+from benchmarks.paper.tables import Section, sections
+from benchmarks.reconfiguration import BEGIN_S, END_S
+from sern_core.vocabulary.errors import SernError
+from sern_tools.checkout import commit
+
+BROWSERS: Final = ("chromium", "chromium-browser", "google-chrome")
+PRINT_S: Final = 120.0
+
+
+def machine() -> str:
+    """What this was measured on, without its name."""
+    model = next(
+        (line.partition(":")[2].strip() for line in _lines(Path("/proc/cpuinfo")) if line.startswith("model name")),
+        platform.machine(),
+    )
+    memory_gb = psutil.virtual_memory().total / 1e9
+    system = f"Linux {platform.release()}, Python {platform.python_version()}"
+    return f"{os.cpu_count()} cores ({model}), {memory_gb:.0f} GB, {system}"
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return []
+
+
+def picture(section: Section) -> str:
+    """The curve of a section as PNG in base64."""
+    plt = pyplot("the report")
+    figure, axes = plt.subplots(figsize=(8, 3), layout="constrained")
+    axes.plot(*zip(*section.curve, strict=True), color="tab:blue", label="load of the bridge, two streams are 1")
+    at_s = [section.curve[0][0], BEGIN_S, BEGIN_S, END_S, END_S, section.curve[-1][0]]
+    streams = axes.twinx()
+    streams.plot(at_s, [2, 2, 3, 3, 2, 2], color="0.4", linestyle=":", label="active streams")
+    streams.set(ylim=(0, 4), ylabel="active streams", yticks=range(5))
+    axes.set(xlabel="s", ylabel="load", ylim=(0, None))
+    figure.legend(loc="outside upper center", ncols=2, frameon=False)
+    out = io.BytesIO()
+    figure.savefig(out, format="png", dpi=110)
+    plt.close(figure)
+    return base64.b64encode(out.getvalue()).decode()
+
+
+def html(results: Sequence[Result], folder: Path, *, quick: bool) -> str:
+    """The whole page."""
+    by_name = {result.step.name: result for result in results}
+    found = list(sections(Figures(by_name), folder))
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+    )
+    return environment.get_template("report.html.j2").render(
+        kind="Quick" if quick else "Full",
+        commit=commit(),
+        machine=machine(),
+        claims=list(claims(by_name)),
+        sections=found,
+        pictures={section.label: picture(section) for section in found if section.curve},
+        errata=list(errata.errata()),
+        results=results,
+    )
+
+
+def print_pdf(page: Path, pdf: Path) -> None:
+    """Print the page. Raises SernError where there is no browser, or it fails."""
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser is None:
+        raise SernError("no report.pdf: it needs a browser that prints; install the Debian package chromium")
+    with tempfile.TemporaryDirectory(prefix="sern-paper-") as profile:
+        words = [
+            browser,
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            f"--user-data-dir={profile}",
+            "--no-pdf-header-footer",
+        ]
+        try:
+            done = subprocess.run(
+                [*words, f"--print-to-pdf={pdf}", page.as_uri()],
+                capture_output=True,
+                text=True,
+                timeout=PRINT_S,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            raise SernError(f"no report.pdf: {browser} had not printed it within {PRINT_S:g} s") from None
+    if done.returncode != 0 or not pdf.exists():
+        last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
+        raise SernError(f"no report.pdf: {browser} ended with {done.returncode}: {last}")

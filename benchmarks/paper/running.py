@@ -1,0 +1,122 @@
+"""Runs the steps, one after the other, and keeps what each of them found."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from benchmarks.child import environment
+from benchmarks.paper.steps import Step
+from sern_core.vocabulary.errors import ConfigError
+from sern_tools.checkout import ROOT, commit
+from sern_tools.harness.processes import last_words
+
+TOLD_S: Final = 60.0
+"""How often a step that goes on is told of where nobody sees a line change."""
+LOOK_S: Final = 0.5
+
+
+class Result(NamedTuple):
+    """What came of a step. `found`: what the benchmark wrote. `why`: it was left out (`failed` False), or failed."""
+
+    step: Step
+    found: dict[str, Any] | None = None
+    why: str = ""
+    failed: bool = False
+    command: str = ""
+    took_s: float = 0.0
+
+
+def command(step: Step, folder: Path, *, quick: bool) -> list[str]:
+    """What is typed in the checkout."""
+    return ["python", "-m", f"benchmarks.{step.name}", *step.arguments(folder, quick=quick)]
+
+
+def kept(step: Step, folder: Path, *, quick: bool) -> Result | None:
+    """What an earlier run of this commit has found, as full as is wanted now; None: nothing. ConfigError for a file
+    that is none of ours."""
+    path = folder / f"{step.name}.json"
+    if not path.exists():
+        return None
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+        if told["quick"] is not quick or told["commit"] != commit():
+            return None
+        return Result(step, told["found"], told["why"], told["failed"], told["command"], told["took_s"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"{path} is no result of a step ({error}): remove it, or give another --out") from error
+
+
+def keep(result: Result, folder: Path, *, quick: bool) -> None:
+    told = {**result._asdict(), "step": result.step.name, "quick": quick, "commit": commit()}
+    path = folder / f"{result.step.name}.json"
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(told) + "\n", encoding="utf-8")
+    part.replace(path)  # whole, or not at all
+
+
+def run(step: Step, folder: Path, *, quick: bool) -> Result:
+    """Run a step; KeyboardInterrupt ends it."""
+    if why := step.missing():
+        return Result(step, why=why)
+    words = command(step, folder, quick=quick)
+    wrote, log = folder / f"{step.name}.found.json", folder / f"{step.name}.log"
+    wrote.unlink(missing_ok=True)
+    began_s = time.monotonic()
+    with log.open("w", encoding="utf-8") as stream:
+        process = subprocess.Popen(
+            [sys.executable, *words[1:], "--json", str(wrote)],
+            stdout=stream, stderr=stream, stdin=subprocess.DEVNULL, cwd=ROOT, env={**os.environ, **environment()},
+        )  # fmt: skip
+        try:
+            _wait(process, step.title, began_s)
+        finally:
+            if process.poll() is None:
+                process.terminate()
+                process.wait()
+    took_s, typed = time.monotonic() - began_s, " ".join(words)
+    if process.returncode != 0 or not wrote.exists():
+        words_left = last_words(log, from_traceback=True) or "it said nothing"
+        return Result(step, None, f"exit status {process.returncode}: {words_left}", True, typed, took_s)
+    found = json.loads(wrote.read_text(encoding="utf-8"))
+    wrote.unlink()
+    return Result(step, found, "" if found["rows"] else " ".join(found["notes"]), False, typed, took_s)
+
+
+def _wait(process: "subprocess.Popen[bytes]", title: str, began_s: float) -> None:
+    told_s = began_s
+    while process.poll() is None:
+        time.sleep(LOOK_S)
+        now_s = time.monotonic()
+        if sys.stderr.isatty():
+            print(f"\r  {title}: {(now_s - began_s) / 60:.1f} minutes so far ", end="", file=sys.stderr, flush=True)
+        elif now_s - told_s >= TOLD_S:
+            told_s = now_s
+            print(f"  {title}: {(now_s - began_s) / 60:.0f} minutes so far", file=sys.stderr, flush=True)
+    if sys.stderr.isatty():
+        print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+
+
+def run_all(steps: Sequence[Step], folder: Path, *, quick: bool) -> list[Result]:
+    """All of them; those that an earlier run of this commit has are taken as they are, but for what failed or was left
+    out, which is tried again."""
+    folder.mkdir(parents=True, exist_ok=True)
+    results = []
+    for number, step in enumerate(steps, 1):
+        known = kept(step, folder, quick=quick)
+        head = f"[{number}/{len(steps)}] {step.title}"
+        if known is not None and known.found is not None:
+            print(f"{head}: from an earlier run of this commit", file=sys.stderr)
+            results.append(known)
+            continue
+        print(f"{head}: about {step.minutes[quick]} minutes", file=sys.stderr, flush=True)
+        result = run(step, folder, quick=quick)
+        if result.why:
+            print(f"  {'failed' if result.failed else 'left out'}: {result.why}", file=sys.stderr)
+        keep(result, folder, quick=quick)
+        results.append(result)
+    return results

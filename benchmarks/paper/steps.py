@@ -1,0 +1,90 @@
+"""What is run for the report, and what each run needs."""
+
+import importlib.util
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from benchmarks.common import MissingError
+from benchmarks.endpoints import ros1
+
+DRIVES: Final = "drives.jsonl"
+"""Drives across campuses, in the folder of the results: a run that was interrupted goes on where it was."""
+SEEDS: Final = 400
+LAB_PACKAGES: Final = {"qemu-system-x86_64": "qemu-system-x86", "busybox": "busybox-static", "ip": "iproute2"}
+
+
+class Step(NamedTuple):
+    """A benchmark that writes a result. `full` and `quick` are its arguments, with `{folder}` for the folder of the
+    results; `minutes` for each, on two cores; `missing` says what it lacks here and what to do, or nothing."""
+
+    name: str
+    title: str
+    full: Sequence[str]
+    quick: Sequence[str]
+    minutes: tuple[int, int]
+    missing: Callable[[], str] = str
+
+    def arguments(self, folder: Path, *, quick: bool) -> list[str]:
+        """Those of `python -m benchmarks.NAME`."""
+        return [word.format(folder=folder) for word in (self.quick if quick else self.full)]
+
+
+def _modules(*names: str, extra: str) -> Callable[[], str]:
+    def missing() -> str:
+        absent = [name for name in names if importlib.util.find_spec(name) is None]
+        return f"{', '.join(absent)} is not installed: pip install 'sern[{extra}]'" if absent else ""
+
+    return missing
+
+
+def lab() -> str:
+    """Why the lab's link cannot be made here; empty: it can."""
+    if os.geteuid() != 0:
+        return "the lab's link needs root: sudo make paper"
+    absent = [package for program, package in LAB_PACKAGES.items() if shutil.which(program) is None]
+    return f"the lab's link needs the Debian packages {' '.join(absent)}" if absent else ""
+
+
+def masters() -> str:
+    """Why there are no ROS masters here; empty: there are."""
+    try:
+        ros1.need(ros1.ROSMASTER, *ros1.NEEDS[ros1.ROSPY])
+    except MissingError as error:
+        return f"it {error}"
+    return ""
+
+
+_TWIN: Final = _modules("numpy", "scipy", extra="twin")
+
+
+def scaling_needs() -> str:
+    """What the levels of load lack here; empty: nothing."""
+    return lab() or masters()
+
+
+STEPS: Final = (
+    Step(
+        "scaling",
+        "more and more robots over the lab's link",
+        (),
+        ("--quick", "--sizes", "small"),
+        (45, 2),
+        scaling_needs,
+    ),
+    Step("sync", "the twin in virtual time", (), ("--quick",), (6, 1), _TWIN),
+    Step("sync_lab", "the twin over the lab's link", (), ("--quick",), (16, 2), lab),
+    Step("reconfiguration", "a stream that comes and goes", (), ("--quick",), (8, 1), masters),
+    Step(
+        "navigation",
+        "three modes of navigation",
+        ("modes", "--seeds", str(SEEDS), "--resume", f"{{folder}}/{DRIVES}"),
+        ("modes", "--seeds", "4", "--resume", f"{{folder}}/{DRIVES}"),
+        (100, 3),
+        _TWIN,
+    ),
+    Step("mmcf", "policies in virtual time", ("--seeds", "20"), ("--quick",), (10, 1)),
+    Step("mmcf_lab", "policies over the lab's link", ("--runs", "20", "--seconds", "18"), ("--quick",), (55, 4), lab),
+)
