@@ -1,6 +1,8 @@
 """Which commit this is, for reports."""
 
+import hashlib
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -15,6 +17,20 @@ def commit(root: Path = ROOT) -> str:
     try:
         hash_ = _git(root, "rev-parse", "--short=12", "HEAD")
         return hash_ + ("-dirty" if _git(root, "status", "--porcelain", "--untracked-files=no", "--", *CODE) else "")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+def code(paths: Sequence[str], root: Path = ROOT) -> str:
+    """What tells the tracked files below these paths (git's pathspecs), as they are now, from those of another state;
+    `unknown` outside a checkout."""
+    try:
+        names = _git(root, "ls-files", "-z", "--", *paths).split("\0")
+        digest = hashlib.sha256()
+        for path in (root / name for name in names if name):
+            digest.update(f"{path.relative_to(root)}\0".encode())
+            digest.update(hashlib.sha256(path.read_bytes()).digest() if path.is_file() else b"")
+        return digest.hexdigest()[:12]
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
 

@@ -1,8 +1,8 @@
 """The paper's tables, figures and claims from runs of our own: `make paper`, `make paper-quick`.
 
-Runs each step, and writes OUT/report.html and OUT/report.pdf. What is done is kept in OUT/results: a run that was
-interrupted, or that lacked something, goes on where it was; another commit begins anew. What is missing here, as root,
-ROS 1 or an extra, leaves out its part, and says why.
+Runs each step, and writes OUT/report.html and OUT/report.pdf. What is done is kept in OUT/results, and
+taken from there while the code that it ran is the same: a run that was interrupted, or that lacked something, goes on
+where it was. What is missing here, as root, ROS 1 or an extra, leaves out its part, and says why.
 """
 
 import argparse

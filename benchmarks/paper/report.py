@@ -2,8 +2,6 @@
 
 import base64
 import io
-import os
-import platform
 import shutil
 import subprocess
 import tempfile
@@ -11,13 +9,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-import psutil
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from benchmarks.common import pyplot
 from benchmarks.paper import errata
 from benchmarks.paper.claims import Figures, claims
-from benchmarks.paper.running import Result
+from benchmarks.paper.running import Result, machine
 from benchmarks.paper.tables import Section, sections
 from benchmarks.reconfiguration import BEGIN_S, END_S
 from sern_core.vocabulary.errors import SernError
@@ -25,24 +22,6 @@ from sern_tools.checkout import commit
 
 BROWSERS: Final = ("chromium", "chromium-browser", "google-chrome")
 PRINT_S: Final = 120.0
-
-
-def machine() -> str:
-    """What this was measured on, without its name."""
-    model = next(
-        (line.partition(":")[2].strip() for line in _lines(Path("/proc/cpuinfo")) if line.startswith("model name")),
-        platform.machine(),
-    )
-    memory_gb = psutil.virtual_memory().total / 1e9
-    system = f"Linux {platform.release()}, Python {platform.python_version()}"
-    return f"{os.cpu_count()} cores ({model}), {memory_gb:.0f} GB, {system}"
-
-
-def _lines(path: Path) -> list[str]:
-    try:
-        return path.read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return []
 
 
 def picture(section: Section) -> str:
@@ -71,14 +50,21 @@ def html(results: Sequence[Result], folder: Path, *, quick: bool) -> str:
     )
     return environment.get_template("report.html.j2").render(
         kind="Quick" if quick else "Full",
-        commit=commit(),
-        machine=machine(),
+        made=_made(results),
         claims=list(claims(by_name)),
         sections=found,
         pictures={section.label: picture(section) for section in found if section.curve},
         errata=list(errata.errata()),
         results=results,
     )
+
+
+def _made(results: Sequence[Result]) -> str:
+    """Of which commits and where, in words; parts say it for themselves where they differ."""
+    commits = list(dict.fromkeys(result.commit for result in results if result.commit)) or [commit()]
+    machines = list(dict.fromkeys(result.machine for result in results if result.machine)) or [machine()]
+    of = f"commit {commits[0]}" if len(commits) == 1 else f"commits {', '.join(commits)}, which differ in other code"
+    return f"{of}, on {' and '.join(machines)}"
 
 
 def print_pdf(page: Path, pdf: Path) -> None:

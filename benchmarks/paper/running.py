@@ -2,6 +2,7 @@
 
 import json
 import os
+import platform
 import subprocess
 import sys
 import time
@@ -9,10 +10,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+import psutil
+
 from benchmarks.child import environment
 from benchmarks.paper.steps import Step
 from sern_core.vocabulary.errors import ConfigError
-from sern_tools.checkout import ROOT, commit
+from sern_tools.checkout import ROOT, code, commit
 from sern_tools.harness.processes import last_words
 
 TOLD_S: Final = 60.0
@@ -29,30 +32,51 @@ class Result(NamedTuple):
     failed: bool = False
     command: str = ""
     took_s: float = 0.0
+    commit: str = ""
+    machine: str = ""
+
+
+def machine() -> str:
+    """What this is measured on, without its name."""
+    model = next(
+        (line.partition(":")[2].strip() for line in _lines(Path("/proc/cpuinfo")) if line.startswith("model name")),
+        platform.machine(),
+    )
+    memory_gb = psutil.virtual_memory().total / 1e9
+    system = f"Linux {platform.release()}, Python {platform.python_version()}"
+    return f"{os.cpu_count()} cores ({model}), {memory_gb:.0f} GB, {system}"
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return []
 
 
 def command(step: Step, folder: Path, *, quick: bool) -> list[str]:
     """What is typed in the checkout."""
-    return ["python", "-m", f"benchmarks.{step.name}", *step.arguments(folder, quick=quick)]
+    below = folder.relative_to(ROOT) if folder.is_relative_to(ROOT) else folder
+    return ["python", "-m", f"benchmarks.{step.name}", *step.arguments(below, quick=quick)]
 
 
 def kept(step: Step, folder: Path, *, quick: bool) -> Result | None:
-    """What an earlier run of this commit has found, as full as is wanted now; None: nothing. ConfigError for a file
-    that is none of ours."""
+    """What an earlier run of the same code by the same command has found; None: nothing. ConfigError for a file that
+    is none of ours."""
     path = folder / f"{step.name}.json"
     if not path.exists():
         return None
     try:
         told = json.loads(path.read_text(encoding="utf-8"))
-        if told["quick"] is not quick or told["commit"] != commit():
+        if told["code"] != code(step.runs) or told["command"] != " ".join(command(step, folder, quick=quick)):
             return None
-        return Result(step, told["found"], told["why"], told["failed"], told["command"], told["took_s"])
+        return Result(**{name: told[name] for name in Result._fields} | {"step": step})
     except (ValueError, KeyError, TypeError) as error:
         raise ConfigError(f"{path} is no result of a step ({error}): remove it, or give another --out") from error
 
 
-def keep(result: Result, folder: Path, *, quick: bool) -> None:
-    told = {**result._asdict(), "step": result.step.name, "quick": quick, "commit": commit()}
+def keep(result: Result, folder: Path) -> None:
+    told = {**result._asdict(), "step": result.step.name, "code": code(result.step.runs)}
     path = folder / f"{result.step.name}.json"
     part = path.with_suffix(".part")
     part.write_text(json.dumps(told) + "\n", encoding="utf-8")
@@ -66,7 +90,7 @@ def run(step: Step, folder: Path, *, quick: bool) -> Result:
     words = command(step, folder, quick=quick)
     wrote, log = folder / f"{step.name}.found.json", folder / f"{step.name}.log"
     wrote.unlink(missing_ok=True)
-    began_s = time.monotonic()
+    of, began_s = commit(), time.monotonic()
     with log.open("w", encoding="utf-8") as stream:
         process = subprocess.Popen(
             [sys.executable, *words[1:], "--json", str(wrote)],
@@ -78,13 +102,13 @@ def run(step: Step, folder: Path, *, quick: bool) -> Result:
             if process.poll() is None:
                 process.terminate()
                 process.wait()
-    took_s, typed = time.monotonic() - began_s, " ".join(words)
+    how = (" ".join(words), time.monotonic() - began_s, of, machine())
     if process.returncode != 0 or not wrote.exists():
         words_left = last_words(log, from_traceback=True) or "it said nothing"
-        return Result(step, None, f"exit status {process.returncode}: {words_left}", True, typed, took_s)
+        return Result(step, None, f"exit status {process.returncode}: {words_left}", True, *how)
     found = json.loads(wrote.read_text(encoding="utf-8"))
     wrote.unlink()
-    return Result(step, found, "" if found["rows"] else " ".join(found["notes"]), False, typed, took_s)
+    return Result(step, found, "" if found["rows"] else " ".join(found["notes"]), False, *how)
 
 
 def _wait(process: "subprocess.Popen[bytes]", title: str, began_s: float) -> None:
@@ -102,21 +126,21 @@ def _wait(process: "subprocess.Popen[bytes]", title: str, began_s: float) -> Non
 
 
 def run_all(steps: Sequence[Step], folder: Path, *, quick: bool) -> list[Result]:
-    """All of them; those that an earlier run of this commit has are taken as they are, but for what failed or was left
-    out, which is tried again."""
+    """All of them; those that an earlier run of the same code has are taken as they are, but for what failed or was
+    left out, which is tried again."""
     folder.mkdir(parents=True, exist_ok=True)
     results = []
     for number, step in enumerate(steps, 1):
         known = kept(step, folder, quick=quick)
         head = f"[{number}/{len(steps)}] {step.title}"
         if known is not None and known.found is not None:
-            print(f"{head}: from an earlier run of this commit", file=sys.stderr)
+            print(f"{head}: from an earlier run, of commit {known.commit}", file=sys.stderr)
             results.append(known)
             continue
         print(f"{head}: about {step.minutes[quick]} minutes", file=sys.stderr, flush=True)
         result = run(step, folder, quick=quick)
         if result.why:
             print(f"  {'failed' if result.failed else 'left out'}: {result.why}", file=sys.stderr)
-        keep(result, folder, quick=quick)
+        keep(result, folder)
         results.append(result)
     return results

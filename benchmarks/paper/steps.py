@@ -9,16 +9,28 @@ from typing import Final, NamedTuple
 
 from benchmarks.common import MissingError
 from benchmarks.endpoints import ros1
+from sern_tools.checkout import code
 
-DRIVES: Final = "drives.jsonl"
-"""Drives across campuses, in the folder of the results: a run that was interrupted goes on where it was."""
+EVERYTHING: Final = ("sern_*", "benchmarks", ":(exclude)benchmarks/paper", "constraints.txt")
+"""The code that a step may run, as git's pathspecs."""
+DRIVEN: Final = (
+    "sern_core/__init__.py",
+    "sern_core/vocabulary",
+    "sern_navigation",
+    "sern_sim",
+    "sern_twin",
+    "benchmarks/__init__.py",
+    "benchmarks/navigation",
+    "constraints.txt",
+)
+"""What a drive across a campus runs."""
 SEEDS: Final = 400
 LAB_PACKAGES: Final = {"qemu-system-x86_64": "qemu-system-x86", "busybox": "busybox-static", "ip": "iproute2"}
 
 
 class Step(NamedTuple):
-    """A benchmark that writes a result. `full` and `quick` are its arguments, with `{folder}` for the folder of the
-    results; `minutes` for each, on two cores; `missing` says what it lacks here and what to do, or nothing."""
+    """A benchmark that writes a result. `full` and `quick` are its arguments, with `{drives}` for the file of
+    drives; `minutes` for each, on two cores; `missing` says what it lacks here and what to do, or nothing."""
 
     name: str
     title: str
@@ -26,10 +38,17 @@ class Step(NamedTuple):
     quick: Sequence[str]
     minutes: tuple[int, int]
     missing: Callable[[], str] = str
+    runs: Sequence[str] = EVERYTHING
+    """The code that it runs: what was found holds until that changes."""
 
     def arguments(self, folder: Path, *, quick: bool) -> list[str]:
         """Those of `python -m benchmarks.NAME`."""
-        return [word.format(folder=folder) for word in (self.quick if quick else self.full)]
+        return [word.format(drives=drives(folder)) for word in (self.quick if quick else self.full)]
+
+
+def drives(folder: Path) -> Path:
+    """Where drives across campuses are kept, of the code of now: a run that was interrupted goes on where it was."""
+    return folder / f"drives-{code(DRIVEN)}.jsonl"
 
 
 def _modules(*names: str, extra: str) -> Callable[[], str]:
@@ -80,10 +99,11 @@ STEPS: Final = (
     Step(
         "navigation",
         "three modes of navigation",
-        ("modes", "--seeds", str(SEEDS), "--resume", f"{{folder}}/{DRIVES}"),
-        ("modes", "--seeds", "4", "--resume", f"{{folder}}/{DRIVES}"),
+        ("modes", "--seeds", str(SEEDS), "--resume", "{drives}"),
+        ("modes", "--seeds", "4", "--resume", "{drives}"),
         (100, 3),
         _TWIN,
+        DRIVEN,
     ),
     Step("mmcf", "policies in virtual time", ("--seeds", "20"), ("--quick",), (10, 1)),
     Step("mmcf_lab", "policies over the lab's link", ("--runs", "20", "--seconds", "18"), ("--quick",), (55, 4), lab),

@@ -18,7 +18,7 @@ from benchmarks.paper.claims import (
     MissingFigure,
 )
 from benchmarks.paper.published import BREAKDOWN, GAPS, MODES, POLICIES, RUNS
-from benchmarks.paper.steps import DRIVES
+from benchmarks.paper.steps import drives as kept_drives
 
 Rows = list[tuple[str, ...]]
 SYSTEMS: Final = {"sern": "SERN", "tcpros": "ROS 1 (TCPROS)", "zmq": "plain ZMQ"}
@@ -133,7 +133,7 @@ def navigation(figures: Figures, folder: Path) -> Section:
              f"{row['success_percent']:.1f} ({row['from_percent']:.1f} to {row['to_percent']:.1f})",
              f"{row['time_median_s']:.1f}", f"{row['interventions_run']:.2f}")
         )  # fmt: skip
-    path = folder / DRIVES
+    path = kept_drives(folder)
     if path.exists():
         rows += [_small(mode, drives) for mode, drives in _drives(path).items() if len(drives) == RUNS]
     return Section(

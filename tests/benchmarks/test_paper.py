@@ -12,13 +12,15 @@ pytest.importorskip("scipy", reason="the extra twin is not installed")
 pytest.importorskip("jinja2", reason="the extra report is not installed")
 pytest.importorskip("matplotlib", reason="the extra report is not installed")
 
-from benchmarks.paper import errata, report, running
+from benchmarks.paper import errata, report, running, steps
 from benchmarks.paper.claims import RECONFIGURED, SYNC_BLACKOUT, SYNC_MODERATE, Figures, Holds, claims
 from benchmarks.paper.published import BREAKDOWN, GAPS, MODES, POLICIES
 from benchmarks.paper.running import Result, kept, run, run_all
 from benchmarks.paper.steps import STEPS, Step
+from benchmarks.paper.steps import drives as kept_drives
 from benchmarks.paper.tables import sections
 from sern_core.vocabulary.errors import ConfigError, SernError
+from sern_tools.checkout import ROOT
 
 BY_NAME = {step.name: step for step in STEPS}
 
@@ -161,7 +163,7 @@ def test_as_many_trials_as_the_paper_has_are_a_row_of_their_own(tmp_path: Path) 
          "interventions": 1}
         for mode in MODES for seed in range(25)
     ]  # fmt: skip
-    (tmp_path / "drives.jsonl").write_text("".join(json.dumps(each) + "\n" for each in drives))
+    kept_drives(tmp_path).write_text("".join(json.dumps(each) + "\n" for each in drives))
     found = {section.label: section for section in sections(Figures(everything()), tmp_path)}["tab:baselines"]
     small = [cells for cells in found.rows if cells[1] == "the first 20 campuses"]
     assert [cells[0] for cells in small] == list(MODES)
@@ -207,14 +209,41 @@ def test_a_step_that_fails_is_told_with_its_last_words_and_the_rest_goes_on(
 
 
 def test_what_is_done_is_not_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(running, "commit", lambda: "abc")
-    done = Result(BY_NAME["mmcf"], {"rows": [row("a", "b", c_s=1.0)], "notes": []}, "", False, "python -m x", 2.0)
-    running.keep(done, tmp_path, quick=True)
+    monkeypatch.setattr(running, "code", lambda paths: "abc")
+    typed = " ".join(running.command(BY_NAME["mmcf"], tmp_path, quick=True))
+    done = Result(BY_NAME["mmcf"], {"rows": [row("a", "b", c_s=1.0)], "notes": []}, "", False, typed, 2.0, "1f", "here")
+    running.keep(done, tmp_path)
     assert kept(BY_NAME["mmcf"], tmp_path, quick=True) == done
     assert kept(BY_NAME["mmcf"], tmp_path, quick=False) is None, "a quick run is no full one"
     assert run_all([BY_NAME["mmcf"]], tmp_path, quick=True) == [done]
-    monkeypatch.setattr(running, "commit", lambda: "def")
-    assert kept(BY_NAME["mmcf"], tmp_path, quick=True) is None, "nor one of another commit"
+    monkeypatch.setattr(running, "code", lambda paths: "def")
+    assert kept(BY_NAME["mmcf"], tmp_path, quick=True) is None, "nor one of other code"
+
+
+def test_drives_of_other_code_are_in_another_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = kept_drives(tmp_path)
+    monkeypatch.setattr(steps, "code", lambda paths: "def")
+    assert kept_drives(tmp_path) != now
+    assert str(kept_drives(tmp_path)) in running.command(BY_NAME["navigation"], tmp_path, quick=False)
+
+
+def test_results_of_drives_hold_as_long_as_all_that_a_drive_runs() -> None:
+    print_files = (
+        "import sys, benchmarks.navigation.campus, benchmarks.navigation.episode\n"
+        "print(*(m.__file__ for n, m in sys.modules.items() if n.startswith(('sern_', 'benchmarks'))), sep='\\n')"
+    )
+    told = subprocess.run([sys.executable, "-c", print_files], capture_output=True, text=True, check=True, cwd=ROOT)
+    files = {Path(line).relative_to(ROOT) for line in told.stdout.split()}
+    assert Path("sern_navigation/mppi.py") in files
+    assert [file for file in files if not any(file.is_relative_to(path) for path in steps.DRIVEN)] == []
+
+
+def test_a_report_from_several_commits_says_so(tmp_path: Path) -> None:
+    one, other = (Result(BY_NAME["mmcf"], why="left out", commit=of, machine="a desk") for of in ("1f", "2e"))
+    assert "Full run of commit 1f, on a desk." in report.html([one, one], tmp_path, quick=False)
+    assert "Full run of commits 1f, 2e, which differ in other code, on a desk." in report.html(
+        [one, other], tmp_path, quick=False
+    )
 
 
 def test_a_file_that_is_no_result_is_an_error_of_one_line(tmp_path: Path) -> None:
