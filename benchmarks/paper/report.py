@@ -1,7 +1,5 @@
 """Writes the report: one page of HTML that needs nothing beside it, and the same as PDF."""
 
-import base64
-import io
 import shutil
 import subprocess
 import tempfile
@@ -11,12 +9,11 @@ from typing import Final
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from benchmarks.common import pyplot
 from benchmarks.paper import errata
 from benchmarks.paper.claims import Figures, claims
+from benchmarks.paper.pictures import pictures
 from benchmarks.paper.running import Result, machine
-from benchmarks.paper.tables import Section, sections
-from benchmarks.reconfiguration import BEGIN_S, END_S
+from benchmarks.paper.tables import sections
 from sern_core.vocabulary.errors import SernError
 from sern_tools.checkout import commit
 
@@ -24,27 +21,10 @@ BROWSERS: Final = ("chromium", "chromium-browser", "google-chrome")
 PRINT_S: Final = 120.0
 
 
-def picture(section: Section) -> str:
-    """The curve of a section as PNG in base64."""
-    plt = pyplot("the report")
-    figure, axes = plt.subplots(figsize=(8, 3), layout="constrained")
-    axes.plot(*zip(*section.curve, strict=True), color="tab:blue", label="load of the bridge, two streams are 1")
-    at_s = [section.curve[0][0], BEGIN_S, BEGIN_S, END_S, END_S, section.curve[-1][0]]
-    streams = axes.twinx()
-    streams.plot(at_s, [2, 2, 3, 3, 2, 2], color="0.4", linestyle=":", label="active streams")
-    streams.set(ylim=(0, 4), ylabel="active streams", yticks=range(5))
-    axes.set(xlabel="s", ylabel="load", ylim=(0, None))
-    figure.legend(loc="outside upper center", ncols=2, frameon=False)
-    out = io.BytesIO()
-    figure.savefig(out, format="png", dpi=110)
-    plt.close(figure)
-    return base64.b64encode(out.getvalue()).decode()
-
-
 def html(results: Sequence[Result], folder: Path, *, quick: bool) -> str:
     """The whole page."""
     by_name = {result.step.name: result for result in results}
-    found = list(sections(Figures(by_name), folder))
+    figures = Figures(by_name)
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
@@ -52,8 +32,8 @@ def html(results: Sequence[Result], folder: Path, *, quick: bool) -> str:
         kind="Quick" if quick else "Full",
         made=_made(results),
         claims=list(claims(by_name)),
-        sections=found,
-        pictures={section.label: picture(section) for section in found if section.curve},
+        sections=list(sections(figures, folder)),
+        pictures=dict(pictures(figures)),
         errata=list(errata.errata()),
         results=results,
     )

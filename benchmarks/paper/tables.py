@@ -25,7 +25,7 @@ SYSTEMS: Final = {"sern": "SERN", "tcpros": "ROS 1 (TCPROS)", "zmq": "plain ZMQ"
 
 
 class Section(NamedTuple):
-    """A table of the paper. `why`: it could not be filled. `curve`: a picture of these points beside it."""
+    """A table of the paper. `why`: it could not be filled."""
 
     title: str
     label: str
@@ -33,7 +33,6 @@ class Section(NamedTuple):
     rows: Sequence[tuple[str, ...]] = ()
     text: str = ""
     why: str = ""
-    curve: Sequence[tuple[float, float]] = ()
 
 
 def scalability(figures: Figures, _folder: Path) -> Section:
@@ -232,15 +231,12 @@ def reconfiguration(figures: Figures, _folder: Path) -> Section:
     ]
     rows.append(("load with the third stream, two are 1", "moderately more", f"{row['load_during_1']:.2f}"))
     rows.append(("load after it", "as before", f"{row['load_after_1']:.2f}"))
-    found = figures.rows("reconfiguration")
-    points = [(float(each["system"].split()[0]), float(each["load_1"])) for each in found if "load_1" in each]
     return Section(
         "A stream that comes and goes",
         "fig:runtime_reconfig_demo",
         ("figure", "paper", "ours"),
         rows,
         "Two real ROS masters, rospy nodes, the installed daemons with keys. Load: CPU of the bridge's processes.",
-        curve=points,
     )
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from benchmarks.common import Report, main
-from benchmarks.sync import cases
+from benchmarks.sync import bounds, cases
 from benchmarks.sync.patches import patches
 
 DATA: Final = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -25,7 +25,7 @@ def bench(options: argparse.Namespace, report: Report) -> None:
     cases.blackout(seeds, report)
     cases.stop(max(1, seeds // 4), report)
     cases.recorded(options.data, report)
-    cases.bound(200 if options.quick else 10_000, report)
+    bounds.bound(200 if options.quick else 10_000, report)
     cases.reckoning(max(1, seeds // 4), report)
     patches(max(1, seeds // 10), report)
     cases.cost(report)

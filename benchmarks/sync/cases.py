@@ -308,49 +308,6 @@ def _learn(slip: Slip, told: list[Command], places: list[Motion]) -> None:
     slip.learn(mean, Twist(way_m / length_s, 0.0, turn / length_s), length_s)
 
 
-# --- the bound --------------------------------------------------------------------------------------------------------
-
-
-def bound(gaps: int, report: Report) -> None:
-    """Robots that do anything within ā of the prediction, and robots that do three times that."""
-    broken, close = 0, []
-    for seed in range(gaps):
-        violated, ratio = _gap(Random(seed), 1.0, anyhow=True)
-        broken += violated
-        close.append(ratio)
-    report.row("bound", "ā holds", tried_gaps=gaps, violated_gaps=broken, largest_over_bound=max(close))
-    wild = max(1, gaps // 10)
-    found = sum(_gap(Random(seed), 3.0, anyhow=False)[0] for seed in range(wild))
-    report.row("bound", "three times ā, one way", tried_gaps=wild, violated_gaps=found)
-    report.reach("bound violated where its assumptions hold, of all", float(broken), 0.0)
-    report.reach("bound reported as violated where they do not, %", 100 * found / wild, 100, at_least=True)
-
-
-def _gap(random: Random, times: float, *, anyhow: bool) -> tuple[bool, float]:
-    """One gap of 0.6 to 10 s: was it reported as violated, and its error over the bound."""
-    allowed_mps2 = random.uniform(0.05, 1.0)
-    options = SynchroniserOptions(least_mismatch_mps2=allowed_mps2, max_speed_mps=50.0, error_m=0.001, error_mps=0.001)
-    twin = Synchroniser(ConstantTwist(), options)
-    start_s = 0.0
-    x_m, y_m, x_mps, y_mps = 0.0, 0.0, 1.0, 0.0
-    twin.measured(start_s, Motion(x_m, y_m, 0.0, Twist(1.0)), now=start_s)
-    heading = random.uniform(0, 2 * math.pi)
-    steps = random.randrange(30, 500)
-    for step in range(steps):
-        if anyhow and step % 25 == 0:
-            heading = random.uniform(0, 2 * math.pi)
-        x_mps2, y_mps2 = (times * allowed_mps2 * part for part in (math.cos(heading), math.sin(heading)))
-        x_m += x_mps * STEP_S + x_mps2 * STEP_S**2 / 2
-        y_m += y_mps * STEP_S + y_mps2 * STEP_S**2 / 2
-        x_mps += x_mps2 * STEP_S
-        y_mps += y_mps2 * STEP_S
-    now = start_s + steps * STEP_S
-    found = Motion(x_m, y_m, math.atan2(y_mps, x_mps), Twist(math.hypot(x_mps, y_mps)))
-    _, gap = twin.measured(now, found, now=now)
-    assert gap is not None
-    return gap.report.violated, gap.report.ratio
-
-
 # --- dead reckoning and cost ------------------------------------------------------------------------------------------
 
 RECKONED: Final = ReckoningOptions(error_m=0.015, silence_s=0.12)

@@ -4,7 +4,7 @@ from pathlib import Path
 from random import Random
 
 from benchmarks.common import Report
-from benchmarks.sync import cases
+from benchmarks.sync import bounds, cases
 from benchmarks.sync.playing import play, ways
 from benchmarks.sync.recording import record
 from benchmarks.sync.robot import plan
@@ -31,8 +31,11 @@ def test_a_stop_is_flagged_and_never_smoothed_over() -> None:
 
 def test_the_bound() -> None:
     report = Report("sync")
-    cases.bound(30, report)
-    assert report.value("bound", "ā holds", "violated_gaps") == 0
+    bounds.bound(30, report)
+    for kept in ("violated_gaps", "speed_violated_gaps", "state_violated_gaps"):
+        assert report.value("bound", "ā holds", kept) == 0
+    assert 0 < report.value("bound", "ā holds", "largest_over_bound") <= 1
+    assert report.value("bound", "ā holds", "state_over_position_bound") > 10, "it grows exponentially"
     assert report.value("bound", "three times ā, one way", "violated_gaps") == 3
 
 
