@@ -11,7 +11,6 @@ confirmed everything is dropped at once, and so is one whose name is revoked. On
 relay is dropped when nobody is left here who needs what is kept of it.
 """
 
-from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -31,9 +30,12 @@ from sern_core.relay.far_objects import PEER_BYTES
 from sern_core.relay.feed_owners import FeedOwners
 from sern_core.relay.forwarding import Forwarding
 from sern_core.relay.holding import Holding
+from sern_core.relay.hub_checks import check_channels, check_streams, taken
 from sern_core.relay.hub_events import GuardedEvents, HubEvents, Relayed
 from sern_core.relay.hub_matching import Matching
 from sern_core.relay.hub_port import HubPort
+from sern_core.relay.hub_subscriptions import Subscriptions
+from sern_core.relay.interest import RoutingLimits
 from sern_core.relay.local_streams import LocalStreams
 from sern_core.relay.moved import MovedClients
 from sern_core.relay.object_exchange import OBJECTS_TOPIC, ObjectExchange
@@ -45,7 +47,7 @@ from sern_core.relay.presence import Presence
 from sern_core.relay.relayed_streams import RelayedStreams
 from sern_core.relay.revocations import Revocations
 from sern_core.relay.route_change import RouteChange
-from sern_core.relay.routing import PEER_TIMES, BadPatternError, RoutingLimits, RoutingTable
+from sern_core.relay.routing import RoutingTable
 from sern_core.relay.traces import Traces
 from sern_core.stream.in_stream import InStream
 from sern_core.stream.out_channel import OutChannel
@@ -53,9 +55,9 @@ from sern_core.stream.out_message import OutMessage
 from sern_core.vocabulary.errors import RefusedError, WireError
 from sern_core.vocabulary.key_news import ClientKeys, RelayKeys
 from sern_core.vocabulary.message import Message
-from sern_core.vocabulary.names import is_client_name, is_peer, name_problem, peer_name
+from sern_core.vocabulary.names import is_peer, peer_name
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
-from sern_core.vocabulary.types import ClientName, DropReason, TopicName
+from sern_core.vocabulary.types import ClientName, DropReason
 from sern_core.wire import framing
 from sern_core.wire.announce import Announcement
 from sern_core.wire.numbering import Numbering
@@ -67,7 +69,6 @@ KEYS_US: Final = 100
 CONFIRMED_PER_US: Final = 8
 """What a client is charged with, in microseconds: to open a datagram lane for it, to look at its keys, and how many
 subscribers are asked for their share of a confirmation in one."""
-MAX_SUBSCRIPTION_PARTS: Final = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +108,6 @@ class Hub:
         self._link_params = link
         self._scheduler_params = scheduler
         self._lossless = lossless
-        self._subscriptions: dict[ClientName, list[str]] = {}  # parts that have arrived
         self._numbering = Numbering()  # of the relay's own streams that were closed
         self._tidy_due_s = now + TIDY_S
         self.after: Callable[[], None] = lambda: None
@@ -213,6 +213,9 @@ class Hub:
             max_claims=params.routing.max_all_streams,
         )
         self.moved = MovedClients(clients, self.routing, streams, self.local_owners)
+        self.subscriptions = Subscriptions(
+            clients, self.events, self.presence, self.matching, self.routing, streams, self.exchange, self.absent
+        )
 
     # --- how the parts hang together ------------------------------------------------------------------------------
 
@@ -258,6 +261,9 @@ class Hub:
 
     def _apply(self, change: RouteChange, now: float) -> None:
         self.streams.apply(change, now)
+
+    def _subscribed(self, client: ClientName, parts: list[str], now: float) -> None:
+        self.subscriptions.take(client, parts, now)
 
     def _own_ended(self, relayed: Relayed, now: float) -> None:
         """A stream of the relay's own has ended: should it come again, it counts on."""
@@ -335,7 +341,7 @@ class Hub:
         lost = [counters for counters in link.counters.values() if counters.topic in reliable]
         self.clients.given_up.keep(client, lost, now=now)
         self.traces.forget(client)
-        self._subscriptions.pop(client, None)
+        self.subscriptions.forget(client)
         self.matching.forget(client)
         self.absent.forget(client)
         self.moved.discard(client)
@@ -484,7 +490,7 @@ class Hub:
         self.moved.discard(link.peer)
         if link.end.peer_boot is not None:
             self.routing.returned(link.peer, link.end.peer_boot)
-        self._subscriptions.pop(link.peer, None)  # half of one that was said in an earlier session
+        self.subscriptions.forget(link.peer)  # half of one that was said in an earlier session
         if not resumed:
             self.streams.prime(link, now)
         self.exchange.came(link, resumed=resumed, now=now)
@@ -610,9 +616,9 @@ class Hub:
     def on_control(self, link: Link, envelope: framing.Envelope, attachment: bytes, *, now: float) -> None:
         kind = envelope["t"]
         if kind == "subscribe":
-            self._subscribe(link.peer, envelope, now)
+            self.subscriptions.told(link.peer, envelope, now)
         elif kind == "objects":
-            self._subscribe_objects(link, envelope, now)
+            self.subscriptions.objects(link, envelope, now)
         elif is_peer(link.peer):
             self.from_peers.message(link, kind, envelope, attachment, now)
         elif kind == "key":
@@ -629,52 +635,6 @@ class Hub:
         else:
             raise WireError(f"unknown control message {kind!r}")
 
-    def _subscribe_objects(self, link: Link, envelope: framing.Envelope, now: float) -> None:
-        try:
-            self.exchange.subscribe(link, envelope, now=now)
-        except RefusedError as refusal:
-            self.events.refused(link.peer, refusal.code, str(refusal))
-            self.clients.tell(
-                link.peer, {"t": "denied", "pattern": "", "code": refusal.code, "why": str(refusal)[:400]}, now
-            )
-
-    def _subscribe(self, client: ClientName, envelope: framing.Envelope, now: float) -> None:
-        parts = self._subscriptions.setdefault(client, [])
-        parts += framing.take_strings(envelope, "patterns")
-        if "known" in envelope:
-            known = framing.take_strings(envelope, "known", max_length=64)
-            self.presence.ask(client, map(ClientName, filter(is_client_name, known)))
-        if framing.take_bool(envelope, "more"):
-            most = MAX_SUBSCRIPTION_PARTS * framing.MAX_ENVELOPE_ITEMS * (PEER_TIMES if is_peer(client) else 1)
-            if len(parts) > most:
-                raise WireError(f"more than {most} subscription patterns")
-            return
-        self.matching.ask(client, self._subscriptions.pop(client), now=now)
-        if framing.take_bool(envelope, "peers"):
-            self.presence.watch(client, now=now)
-        if framing.take_bool(envelope, "keys"):
-            self.events.keys_asked(client)
-
-    def _subscribed(self, client: ClientName, parts: list[str], now: float) -> None:
-        self.absent.subscribed(client)
-        # What is a name and no pattern is denied by name: that gives nothing away about what there is.
-        names = {TopicName(part) for part in parts if name_problem(part) is None}
-        patterns = [part for part in parts if part not in names]
-        try:
-            self.streams.apply(self.routing.subscribe(client, patterns, exact=names), now)
-            if self.streams.draining.has(client):
-                self.streams.draining.keep(
-                    lambda other, stream: other != client or self.routing.takes(client, stream.topic),
-                    DropReason.UNWANTED,
-                    now=now,
-                )
-        except RefusedError as refusal:
-            self.events.refused(client, refusal.code, str(refusal))
-            bad = refusal.pattern if isinstance(refusal, BadPatternError) else ""
-            self.clients.tell(
-                client, {"t": "denied", "pattern": bad, "code": refusal.code, "why": str(refusal)[:400]}, now
-            )
-
     def validate(self) -> None:
         """Internal consistency, for tests."""
         self.clients.validate()
@@ -683,40 +643,10 @@ class Hub:
         self.streams.replays.validate()
         self.definitions.validate()
         self.traces.validate()
-        for identity, relayed in self.relayed.items():
-            outs = set(self.routing.subscribers(identity))
-            held = set(relayed.outs) | relayed.unopened | relayed.waiting.keys()
-            held |= set(self.streams.moves.waiting(identity))
-            assert not relayed.waiting or self.streams.fanout.holds(relayed), (
-                f"{identity.topic}: some are never told of it"
-            )
-            assert relayed.unopened.isdisjoint(relayed.waiting), f"{identity.topic}: who waits was told already"
-            assert held == outs, f"{identity.topic}: channels {held} but routes {outs}"
-            assert not relayed.unopened & set(relayed.outs), f"{identity.topic}: a channel that could not be opened"
-            latched = relayed.stream.stream.spec.latched
-            assert (relayed.cache is not None) == latched, f"{identity.topic}: its cache does not fit its spec"
-            for client, (link, channel) in relayed.outs.items():
-                assert self.links.get(client) is link, f"{identity.topic} goes to a link of {client} that is gone"
-                assert link.outgoing.by_stream.get(identity) is channel, (
-                    f"{identity.topic}: a closed channel to {client}"
-                )
-        for announcer in self.streams.fanout.announcers():
-            assert announcer in self.links, f"streams of {announcer}, who is gone, are to be told of"
-        taken: dict[ClientName, Counter[ClientName]] = defaultdict(Counter)
-        for identity, relayed in self.relayed.items():
-            for client in relayed.outs if identity.origin not in self.local_owners else ():
-                taken[client][identity.origin] += 1
-        self.presence.validate(taken)
-        known = {info.id for info in self.routing.infos()}
-        assert known == self.relayed.keys(), f"routes and streams differ: {known ^ self.relayed.keys()}"
-        held_channels = {id(pair[1]) for relayed in self.relayed.values() for pair in relayed.outs.values()}
-        held_channels |= self.streams.fanout.closing()
-        held_channels |= self.streams.draining.validate(self.links)
-        held_channels |= self.exchange.channels()
+        check_streams(self.streams, self.routing, self.links)
+        check_channels(self.streams, self.links, self.exchange.channels())
+        self.presence.validate(taken(self.streams, self.local_owners))
         self.exchange.validate()
-        for client, link in self.links.items():
-            for channel in link.sender.channels.values():
-                assert id(channel) in held_channels, f"{channel.stream.id.topic}: nobody's channel to {client}"
         self.absent.validate(self.links)
         self.peers.validate()
         self.claims.validate()

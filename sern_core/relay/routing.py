@@ -32,13 +32,14 @@ Who announces is the caller's business: `StreamInfo.id.origin` must be the name 
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Container, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 from sern_core.relay.access import AccessTable, Right
+from sern_core.relay.interest import PEER_TIMES, Interest, RoutingLimits, Topic, refused
 from sern_core.relay.peer_rights import PeerRights
 from sern_core.relay.route_change import NO_CHANGE, Denied, RouteChange, RouteCollector
-from sern_core.topics.patterns import MAX_CLIENT_PROGRAM, PatternError, PatternSet
+from sern_core.topics.patterns import PatternError, PatternSet
 from sern_core.vocabulary.errors import RefusedError
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo
 from sern_core.vocabulary.names import name_problem, plain_type
@@ -56,61 +57,6 @@ COMPILE_UNITS: Final = 200
 """Compiling, for each instruction of the program and each character of a pattern."""
 
 
-PEER_TIMES: Final = 64
-"""A peer speaks for many clients: it may want so many times as much as one."""
-
-
-class BadPatternError(RefusedError):
-    """A client subscribes to something that is no pattern."""
-
-    def __init__(self, pattern: str, problem: str) -> None:
-        super().__init__("bad_pattern", f"pattern {pattern[:80]!r} {problem}")
-        self.pattern = pattern
-
-
-@dataclass(frozen=True, slots=True)
-class RoutingLimits:
-    """What one client may hold in the table; beyond it the client is refused by name."""
-
-    max_streams: int = 2_000
-    max_patterns: int = 256
-    max_exact: int = 4_096
-    max_program: int = MAX_CLIENT_PROGRAM
-    """What all patterns of a client may need together, in instructions of RE2."""
-    max_all_streams: int = 60_000
-    """What all clients may have together: what fits into the channel numbers of one that takes everything."""
-    slice_units: int = 2_000_000
-    """Matching that is done in one go."""
-
-
-class _Interest:
-    """What one client wants; `topics` are the known global names that it wants and may have.
-
-    `left` are names that have not been looked at since the interest or the access rules changed.
-    """
-
-    __slots__ = ("exact", "left", "patterns", "topics")
-
-    def __init__(self, patterns: PatternSet, exact: set[TopicName]) -> None:
-        self.patterns = patterns
-        self.exact = exact
-        self.topics: set[TopicName] = set()
-        self.left: deque[TopicName] = deque()
-
-    def wants(self, topic: TopicName) -> bool:
-        return topic in self.exact or self.patterns.fullmatch(topic)
-
-
-class _Topic:
-    """One global name: its streams by origin, and the clients that want it and may have it, origins included."""
-
-    __slots__ = ("streams", "subscribers")
-
-    def __init__(self) -> None:
-        self.streams: dict[ClientName, StreamId] = {}
-        self.subscribers: set[ClientName] = set()
-
-
 class RoutingTable:
     """See the module's text. Not thread-safe; every call either works or raises and changes nothing."""
 
@@ -126,11 +72,11 @@ class RoutingTable:
         self._via: dict[StreamId, ClientName] = {}  # the peer that a stream came from
         self._infos: dict[StreamId, StreamInfo] = {}
         self._routes: dict[StreamId, tuple[ClientName, ...]] = {}
-        self._topics: dict[TopicName, _Topic] = {}
+        self._topics: dict[TopicName, Topic] = {}
         self._by_client: dict[ClientName, dict[TopicName, StreamId]] = {}
         self._boots: dict[ClientName, int] = {}
         self._retired: dict[ClientName, deque[int]] = {}
-        self._interests: dict[ClientName, _Interest] = {}
+        self._interests: dict[ClientName, Interest] = {}
         self._wanted: tuple[str, ...] | None = None  # see `interests`; None: to be worked out
         self.spent_units = 0
         """What the last `announce`, `subscribe`, `go_on` or `set_access` has cost."""
@@ -289,11 +235,11 @@ class RoutingTable:
         try:
             wanted = PatternSet(texts, max_program=many * self._limits.max_program)
         except PatternError as error:
-            raise _refused(error, client) from None
+            raise refused(error, client) from None
         self.spent_units += COMPILE_UNITS * wanted.program
         change = RouteCollector()
         change.denied.update(denied)
-        self._set_interest(client, _Interest(wanted, names), change)
+        self._set_interest(client, Interest(wanted, names), change)
         return change.result(self._routes)
 
     def also(self, client: ClientName, topic: TopicName) -> RouteChange:
@@ -309,7 +255,7 @@ class RoutingTable:
                 "too_many_patterns", f"{client} has {len(exact)} names already, which is the limit; use a pattern"
             )
         if interest is None:
-            interest = self._interests[client] = _Interest(PatternSet(()), exact)
+            interest = self._interests[client] = Interest(PatternSet(()), exact)
         exact.add(topic)
         self._wanted = None
         change = RouteCollector()
@@ -525,7 +471,7 @@ class RoutingTable:
         change.added.add(stream.id)
         topic = self._topics.get(name)
         if topic is None:
-            topic = self._topics[name] = _Topic()
+            topic = self._topics[name] = Topic()
             for client, interest in self._interests.items():
                 if self._takes(client, interest, name):
                     interest.topics.add(name)
@@ -547,7 +493,7 @@ class RoutingTable:
                 self._interests[client].topics.discard(stream.topic)
             del self._topics[stream.topic]
 
-    def _set_interest(self, client: ClientName, interest: _Interest | None, change: RouteCollector) -> None:
+    def _set_interest(self, client: ClientName, interest: Interest | None, change: RouteCollector) -> None:
         old = self._interests.pop(client, None)
         self._wanted = None
         if interest is not None:
@@ -559,14 +505,14 @@ class RoutingTable:
             for name in old.topics:
                 self._set_subscriber(client, name, change, takes=False)
 
-    def _to_look_at(self, interest: _Interest) -> deque[TopicName]:
+    def _to_look_at(self, interest: Interest) -> deque[TopicName]:
         """The names that may come to the interest or leave it, those that it names itself first."""
         if interest.patterns.texts:
             return deque(self._topics)
         named = interest.exact & self._topics.keys()
         return deque((*sorted(named - interest.topics), *sorted(interest.topics - named)))
 
-    def _takes(self, client: ClientName, interest: _Interest, name: TopicName) -> bool:
+    def _takes(self, client: ClientName, interest: Interest, name: TopicName) -> bool:
         """Whether the client wants the name and may have it. What may take long is asked last."""
         steps = interest.patterns.steps(name)
         if steps:
@@ -576,7 +522,7 @@ class RoutingTable:
             return interest.wants(name)
         return interest.wants(name) and self._may_have(client, name)
 
-    def _match_some(self, client: ClientName, interest: _Interest, change: RouteCollector) -> None:
+    def _match_some(self, client: ClientName, interest: Interest, change: RouteCollector) -> None:
         """Match names that are left against the client's rights and interest, one slice of them at least by one."""
         left = interest.left
         while left:
@@ -654,12 +600,6 @@ def type_problem(mine: TopicInfo, theirs: TopicInfo) -> str | None:
     if comparable and mine.type_hash != theirs.type_hash:
         return f"its {mine.type_name} has hash {mine.type_hash}, and {theirs.type_hash}"
     return None
-
-
-def _refused(error: PatternError, client: ClientName) -> RefusedError:
-    if error.text is not None:
-        return BadPatternError(error.text, str(error))
-    return RefusedError("too_many_patterns", f"{client}: {error}")
 
 
 def _same(one: StreamInfo, other: StreamInfo) -> bool:

@@ -13,7 +13,7 @@ from sern_client.endpoints.ros1 import Ros1Options
 from sern_client.endpoints.ros1 import first_messages as ros1_first_messages
 from sern_core.link import control_stream, definitions
 from sern_core.objects.values import ObjectLimits
-from sern_core.relay import absent, access, draining, far_objects, feed_owners, peer_objects, routing
+from sern_core.relay import absent, access, draining, far_objects, feed_owners, interest, peer_objects, routing
 from sern_core.site import peers
 from sern_core.stream import decoding, drop_reports, in_stream, latched, prices
 from sern_core.vocabulary import ledger
@@ -24,7 +24,7 @@ from sern_runtime import feed_inflow, feed_subscriptions, priority_paths
 from sern_runtime.config.relay import RelaySection, ReplaySection
 
 ROOT: Final = Path(__file__).resolve().parents[2]
-ROUTING, OBJECTS = routing.RoutingLimits(), ObjectLimits()
+ROUTING, OBJECTS = interest.RoutingLimits(), ObjectLimits()
 
 
 def nbytes(count: int) -> str:

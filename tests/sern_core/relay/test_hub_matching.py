@@ -4,7 +4,8 @@ from sern_core.relay import routing
 from sern_core.relay.access import AccessRule, AccessTable
 from sern_core.relay.hub import HubParams
 from sern_core.relay.hub_matching import MATCHING_SHARE
-from sern_core.relay.routing import UNIT_S, RoutingLimits
+from sern_core.relay.interest import RoutingLimits
+from sern_core.relay.routing import UNIT_S
 from tests.fuzz.test_hostile_peer import Hostile
 from tests.world import World, spec
 

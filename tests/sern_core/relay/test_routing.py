@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
 
 from sern_core.relay.access import AccessRule, AccessTable
+from sern_core.relay.interest import RoutingLimits
 from sern_core.relay.route_change import NO_CHANGE, Denied, Match, RouteChange
-from sern_core.relay.routing import NAME_UNITS, RoutingLimits, RoutingTable
+from sern_core.relay.routing import NAME_UNITS, RoutingTable
 from sern_core.vocabulary.errors import RefusedError
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.vocabulary.types import ClientName, Encoding, PriorityClass, TopicName
