@@ -2,12 +2,29 @@
 
 import pytest
 
+from sern_core.link.link import Link
 from sern_core.relay.hub_port import HubPort
 from sern_core.vocabulary.errors import VersionError, WireError
 from sern_core.vocabulary.types import ClientName, PriorityClass
 from sern_core.wire import framing
 from sern_sim.models import LinkModel, Window
+from sern_sim.ports import Port
 from tests.world import ClockedPort, SimClient, World, spec
+
+
+class OverPort:
+    """A port with whose session it is over as soon as anything comes."""
+
+    def __init__(self, port: Port, link: Link) -> None:
+        self._link = link
+        self.next_datagram = port.next_datagram
+        self.next_deadline = port.next_deadline
+        self.handle_timeout = port.handle_timeout
+        self.connected = port.connected
+        self.disconnected = port.disconnected
+
+    def receive(self, _data: bytes, *, now: float) -> None:
+        self._link.disconnected(now=now)
 
 
 def kinds(world: World, client: SimClient) -> tuple[list[str], list[str]]:
@@ -242,12 +259,10 @@ def test_a_session_whose_end_the_client_was_not_told_of_is_found_to_be_over() ->
     world = World()
     client = world.client("robot", LinkModel(delay_s=0.02).as_stream())
     world.run(2.0)
-    port = inner(world, client)
-    link, receive = world.relay.hub.links[client.name], port.receive
-
-    port.receive = lambda data, *, now: link.disconnected(now=now)  # type: ignore[method-assign]
+    place, link = world.relay.port(client.name), world.relay.hub.links[client.name]
+    real, place.inner = place.inner, OverPort(place.inner, link)
     world.run(0.7)
-    port.receive = receive  # type: ignore[method-assign]
+    place.inner = real
     world.run(5.0)
     assert [link.established, client.core.link.established] == [False, True], "it may be a blackout"
     world.run(20.0)
