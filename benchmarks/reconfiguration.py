@@ -24,7 +24,7 @@ from benchmarks import child, recordings
 from benchmarks.common import MissingError, Report, half_width_95, main, medians, repetition_arguments, repetitions
 from benchmarks.endpoints import ros1
 from benchmarks.endpoints.shared import HOST, ROBOT, SITE, START_S, said, start_chain
-from benchmarks.paper.published import DETECTED_S, FORWARDED_S, REMOVED_S
+from benchmarks.paper.published import BEGIN_S, DETECTED_S, END_S, FORWARDED_S, REMOVED_S
 from sern_client.endpoints.ros1.xmlrpc import CallError, XmlRpcClient
 from sern_core.vocabulary.errors import SernError
 from sern_tools.harness.processes import Child, cpu_s
@@ -34,7 +34,6 @@ RATE_HZ: Final = 10.0
 FIRST: Final = ("/bench/robot1/points", "/bench/robot2/points")
 NEW: Final = "/bench/robot3/points"
 SETTLE_S: Final = 2.0
-BEGIN_S, END_S = 2.0, 8.0
 WHOLE_S: Final = 12.0
 LOOK_S: Final = 0.01
 BIN_S: Final = 0.1

@@ -43,7 +43,7 @@ from benchmarks.common import (
 from benchmarks.endpoints import ros1
 from benchmarks.link.runs import START_S, congestion, sleep_until, start_daemon, start_relay
 from benchmarks.link.sern import RELAY_PORT
-from benchmarks.paper.published import LATENCY_SAVED_PERCENT, LOAD_SAVED_PERCENT
+from benchmarks.paper.published import LEVELS, MOST_LATENCY, MOST_LOAD
 from sern_core.vocabulary.errors import SernError
 from sern_sim.models import LinkModel
 from sern_tools.harness.files import client_content, write
@@ -51,7 +51,6 @@ from sern_tools.harness.processes import Child, Children, killed, python
 from sern_tools.keygen import make_keys
 from sern_tools.lab.lab import Lab, Node
 
-LEVELS: Final = (2, 3, 5)
 SIZES: Final = {"small": (10_000, 20.0), "large": (200_000, 10.0)}
 LINKS: Final = {"idle": 3.0, "full": 0.6}
 """What the link carries, of what is offered."""
@@ -66,8 +65,6 @@ WARM_S: Final = 1.0
 RUN_S: Final = 3.0
 FEW_ROUNDS: Final = 5
 """Runs of each system where the link is full, and of those that the paper does not compare: what they say is plain."""
-PAPER_LATENCY: Final = 1.0 - LATENCY_SAVED_PERCENT[0] / 100
-PAPER_LOAD: Final = 1.0 - LOAD_SAVED_PERCENT / 100
 
 
 class Case(NamedTuple):
@@ -302,7 +299,7 @@ def bench(options: argparse.Namespace, report: Report) -> None:
             for system, row in found.items():
                 report.row(case.name, system, **row)
             ours, theirs = found[SERN], found[TCPROS]
-            for what, metric, limit in (("latency", "latency_ms", PAPER_LATENCY), ("CPU", "far_percent", PAPER_LOAD)):
+            for what, metric, limit in (("latency", "latency_ms", MOST_LATENCY), ("CPU", "far_percent", MOST_LOAD)):
                 name = f"{case.name}: {what} over that of TCPROS (paper: .75 to .85 in latency, .85 in load)"
                 report.reach(name, ours[metric] / theirs[metric], limit)
         power = "RAPL, the package"

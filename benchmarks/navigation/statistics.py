@@ -4,8 +4,6 @@ from collections.abc import Sequence
 from math import sqrt
 from typing import Final
 
-from scipy.stats import binomtest
-
 Z_95: Final = 1.96
 
 
@@ -21,6 +19,8 @@ def wilson(met: int, of: int) -> tuple[float, float]:
 
 def mcnemar(one: Sequence[bool], other: Sequence[bool]) -> float:
     """How likely pairs differ so much or more if both are as good (McNemar, 1947; exact, two-sided)."""
+    from scipy.stats import binomtest  # of the extra twin: what needs no scipy goes without
+
     better = sum(a and not b for a, b in zip(one, other, strict=True))
     worse = sum(b and not a for a, b in zip(one, other, strict=True))
     return float(binomtest(better, better + worse, 0.5).pvalue) if better + worse else 1.0

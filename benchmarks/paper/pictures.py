@@ -3,13 +3,11 @@
 import base64
 import io
 from collections.abc import Callable, Iterator, Mapping
-from itertools import product
 from typing import Any, Final
 
 from benchmarks.common import pyplot
 from benchmarks.paper.claims import Figures
-from benchmarks.reconfiguration import BEGIN_S, END_S
-from benchmarks.scaling import LINKS, SIZES, SYSTEMS
+from benchmarks.paper.published import BEGIN_S, END_S
 
 METRICS: Final = {
     "latency_ms": "latency, ms",
@@ -17,23 +15,22 @@ METRICS: Final = {
     "far_MB": "memory, MB",
     "power_W": "power, W",
 }
-COLOURS: Final[Mapping[str, str]] = dict(zip(SYSTEMS, ("tab:orange", "tab:blue", "tab:green", "0.5"), strict=True))
+COLOURS: Final = {"sern": "tab:blue", "tcpros": "tab:orange", "zmq": "tab:green", "zenoh": "0.5"}
 
 
 def scalability(plt: Any, figures: Figures) -> Any:
     """Each metric by the number of robots, a row for each size of cloud and kind of link."""
     found = figures.rows("scaling")
-    cases = [f"{size} clouds, {link} link" for size, link in product(SIZES, LINKS)]
-    cases = [case for case in cases if any(row["case"].endswith(case) for row in found)]
+    cases = list(dict.fromkeys(row["case"].partition(", ")[2] for row in found))
     figure, grid = plt.subplots(
         len(cases), len(METRICS), figsize=(10, 0.6 + 2 * len(cases)), layout="constrained", squeeze=False
     )
     for axes_of_case, case in zip(grid, cases, strict=True):
         for axes, (metric, name) in zip(axes_of_case, METRICS.items(), strict=True):
-            for system in SYSTEMS:
+            for system, colour in COLOURS.items():
                 rows = [row for row in found if row["case"].endswith(case) and row["system"] == system]
                 points = sorted((int(row["case"].split()[0]), float(row[metric])) for row in rows)
-                axes.plot(*zip(*points, strict=True), marker="o", markersize=3, color=COLOURS[system], label=system)
+                axes.plot(*zip(*points, strict=True), marker="o", markersize=3, color=colour, label=system)
             if metric == "latency_ms" and case.endswith("full link"):
                 axes.set(yscale="log")
             else:
@@ -44,7 +41,7 @@ def scalability(plt: Any, figures: Figures) -> Any:
         axes_of_case[0].set_ylabel(case, fontsize=9)
     figure.supxlabel("robots", fontsize=9)
     lines, names = grid[0][0].get_legend_handles_labels()
-    figure.legend(lines, names, loc="outside upper center", ncols=len(SYSTEMS), frameon=False)
+    figure.legend(lines, names, loc="outside upper center", ncols=len(COLOURS), frameon=False)
     return figure
 
 
@@ -71,7 +68,7 @@ ALL: Final[Mapping[str, tuple[str, Callable[[Any, Figures], Any]]]] = {
 
 
 def pictures(figures: Figures) -> Iterator[tuple[str, str]]:
-    """Labels with their pictures, as PNG in base64; none of what was not run."""
+    """Labels with their pictures, as PNG in base64; none of what was not run. ConfigError without matplotlib."""
     plt = pyplot("the report")
     for label, (step, draw) in ALL.items():
         if figures.rows(step):

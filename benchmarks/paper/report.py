@@ -14,7 +14,7 @@ from benchmarks.paper.claims import Figures, claims
 from benchmarks.paper.pictures import pictures
 from benchmarks.paper.running import Result, machine
 from benchmarks.paper.tables import sections
-from sern_core.vocabulary.errors import SernError
+from sern_core.vocabulary.errors import ConfigError, SernError
 from sern_tools.checkout import commit
 
 BROWSERS: Final = ("chromium", "chromium-browser", "google-chrome")
@@ -25,6 +25,11 @@ def html(results: Sequence[Result], folder: Path, *, quick: bool) -> str:
     """The whole page."""
     by_name = {result.step.name: result for result in results}
     figures = Figures(by_name)
+    drawn, not_drawn = {}, ""
+    try:
+        drawn = dict(pictures(figures))
+    except ConfigError as error:
+        not_drawn = f"No pictures: {error}"
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
@@ -33,7 +38,8 @@ def html(results: Sequence[Result], folder: Path, *, quick: bool) -> str:
         made=_made(results),
         claims=list(claims(by_name)),
         sections=list(sections(figures, folder)),
-        pictures=dict(pictures(figures)),
+        pictures=drawn,
+        not_drawn=not_drawn,
         errata=list(errata.errata()),
         results=results,
     )

@@ -10,8 +10,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-import psutil
-
 from benchmarks.child import environment
 from benchmarks.paper.steps import Step
 from sern_core.vocabulary.errors import ConfigError
@@ -42,7 +40,7 @@ def machine() -> str:
         (line.partition(":")[2].strip() for line in _lines(Path("/proc/cpuinfo")) if line.startswith("model name")),
         platform.machine(),
     )
-    memory_gb = psutil.virtual_memory().total / 1e9
+    memory_gb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
     system = f"Linux {platform.release()}, Python {platform.python_version()}"
     return f"{os.cpu_count()} cores ({model}), {memory_gb:.0f} GB, {system}"
 

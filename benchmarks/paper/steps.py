@@ -20,7 +20,10 @@ DRIVEN: Final = (
     "sern_sim",
     "sern_twin",
     "benchmarks/__init__.py",
-    "benchmarks/navigation",
+    "benchmarks/navigation/__init__.py",
+    "benchmarks/navigation/campus.py",
+    "benchmarks/navigation/drives.py",
+    "benchmarks/navigation/episode.py",
     "constraints.txt",
 )
 """What a drive across a campus runs."""
@@ -59,12 +62,17 @@ def _modules(*names: str, extra: str) -> Callable[[], str]:
     return missing
 
 
+_TWIN: Final = _modules("numpy", "scipy", extra="twin")
+_MEASURED: Final = _modules("psutil", extra="bench")
+_COMPARED: Final = _modules("zenoh", extra="bench")
+
+
 def lab() -> str:
     """Why the lab's link cannot be made here; empty: it can."""
     if os.geteuid() != 0:
         return "the lab's link needs root: sudo make paper"
     absent = [package for program, package in LAB_PACKAGES.items() if shutil.which(program) is None]
-    return f"the lab's link needs the Debian packages {' '.join(absent)}" if absent else ""
+    return f"the lab's link needs the Debian packages {' '.join(absent)}" if absent else _MEASURED()
 
 
 def masters() -> str:
@@ -76,12 +84,9 @@ def masters() -> str:
     return ""
 
 
-_TWIN: Final = _modules("numpy", "scipy", extra="twin")
-
-
 def scaling_needs() -> str:
     """What the levels of load lack here; empty: nothing."""
-    return lab() or masters()
+    return lab() or masters() or _COMPARED()
 
 
 STEPS: Final = (
@@ -103,7 +108,7 @@ STEPS: Final = (
         ("modes", "--seeds", "4", "--resume", "{drives}"),
         (100, 3),
         _TWIN,
-        DRIVEN,
+        ("benchmarks/navigation", *DRIVEN),
     ),
     Step("mmcf", "policies in virtual time", ("--seeds", "20"), ("--quick",), (10, 1)),
     Step("mmcf_lab", "policies over the lab's link", ("--runs", "20", "--seconds", "18"), ("--quick",), (55, 4), lab),

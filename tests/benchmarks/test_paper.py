@@ -190,6 +190,22 @@ def test_the_page_has_all_of_it_and_needs_nothing_else(tmp_path: Path) -> None:
     assert 'src="http' not in page and "<link" not in page
 
 
+def test_without_what_draws_the_page_says_so_and_has_the_rest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    page = report.html(list(everything().values()), tmp_path, quick=True)
+    assert "No pictures: the report needs matplotlib: pip install matplotlib" in page
+    assert "<img" not in page and "fig:runtime_reconfig_demo" in page
+
+
+def test_without_scipy_its_sums_are_left_out_and_the_others_are_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("scipy.optimize", "scipy.stats"):
+        monkeypatch.setitem(sys.modules, name, None)
+    found = list(errata.errata())
+    assert [each.label for each in found] == list(errata.ALL)
+    left_out = [each.label for each in found if "pip install 'sern[twin]'" in each.follows]
+    assert left_out == ["tab:mmcf_eval, tab:mmcf_breakdown", "tab:baselines"]
+
+
 def test_without_a_browser_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(SernError, match="install the Debian package chromium"):

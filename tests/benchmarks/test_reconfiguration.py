@@ -3,8 +3,9 @@
 import pytest
 
 from benchmarks import recordings
+from benchmarks.paper.published import LEVELS
 from benchmarks.reconfiguration import FIRST, RATE_HZ, Arrival, Outcome, curve, loads, longest_pause, summary
-from benchmarks.scaling import LEVELS, LINKS, SIZES, Case, cases
+from benchmarks.scaling import LINKS, SIZES, Case, cases
 from benchmarks.scaling import summary as scaling_summary
 from sern_core.vocabulary.errors import SernError
 
