@@ -26,7 +26,7 @@ from benchmarks import recordings
 from benchmarks.common import Report, main, positive, try_realtime
 from benchmarks.link.runs import DRAIN_S, START_S, STOP_S, sleep_until, start_daemon, start_relay
 from benchmarks.link.sern import RELAY_PORT
-from benchmarks.mmcf_replay import CLOUD_HZ, EVERY_NTH_POINT, recorded, tabulate
+from benchmarks.mmcf_replay import CLOUD_HZ, EVERY_NTH_POINT, PROFILES, recorded, tabulate
 from sern_core.adaptation.adapter import AdapterParams
 from sern_core.adaptation.cost import measure as measure_cost
 from sern_core.adaptation.model import ClassDemand, ClassOutcome, Terms
@@ -312,7 +312,7 @@ def measure(options: argparse.Namespace, report: Report) -> None:
         if options.traces is not None:
             options.traces.mkdir(parents=True, exist_ok=True)
             directory = Path(tempfile.mkdtemp(prefix="run-", dir=options.traces)).resolve()
-        tabulate(report, _runner(lab, directory, duration_s), options.runs)
+        tabulate(report, _runner(lab, directory, duration_s), options.runs, options.profiles)
         report.note(
             f"{recordings.note()}; lab: {lab.backend}; {note}; {duration_s} s a run, means over intervals of 1 s"
         )
@@ -321,6 +321,7 @@ def measure(options: argparse.Namespace, report: Report) -> None:
 def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--runs", type=positive, default=1, metavar="N", help="of each policy, in mixed order")
     parser.add_argument("--seconds", type=positive, metavar="N", help=f"of a run, in place of {RUN_S}")
+    parser.add_argument("--profiles", nargs="+", choices=PROFILES, default=PROFILES, help="these alone")
     parser.add_argument("--traces", type=Path, metavar="DIR", help="keep logs and /api/mmcf in a new folder there")
 
 

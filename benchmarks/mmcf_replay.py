@@ -10,7 +10,7 @@ wire. Then the paper's section "Runtime Reconfiguration Evaluation": two robots'
 
 import argparse
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
@@ -116,7 +116,12 @@ def tables(report: Report, duration_s: float, links: tuple[str, ...], seeds: int
     tabulate(report, intervals, seeds)
 
 
-def tabulate(report: Report, intervals: Callable[[AdaptationSection, int], list[Terms]], runs: int) -> None:
+def tabulate(
+    report: Report,
+    intervals: Callable[[AdaptationSection, int], list[Terms]],
+    runs: int,
+    profiles: Sequence[str] = PROFILES,
+) -> None:
     """Policy by profile: the means of the terms over the intervals of all runs, and what they cost, with half the width
     of the 95 % confidence interval over the runs.
 
@@ -125,7 +130,7 @@ def tabulate(report: Report, intervals: Callable[[AdaptationSection, int], list[
     intervals'.
     """
     report.note("terms: 1 is 0.5 s of latency, no reliability, a quarter of a core, all that the link carries")
-    cases = [(profile, policy) for profile in PROFILES for policy in POLICIES]
+    cases = [(profile, policy) for profile in profiles for policy in POLICIES]
     sections = {
         (profile, policy): AdaptationSection.model_validate({"policy": policy, "profile": profile})
         for profile, policy in cases
@@ -134,7 +139,7 @@ def tabulate(report: Report, intervals: Callable[[AdaptationSection, int], list[
     for number in range(runs):
         for case in cases if number % 2 == 0 else reversed(cases):
             found[case].append(mean_terms(intervals(sections[case], number)))
-    for profile in PROFILES:
+    for profile in profiles:
         means: dict[str, float] = {}
         for policy in POLICIES:
             mine, weights = found[profile, policy], sections[profile, policy].cost_weights()

@@ -15,7 +15,7 @@ from benchmarks.paper.steps import STEPS
 from sern_core.vocabulary.errors import SernError
 
 OUT: Final = Path("paper-out")
-NAMES: Final = tuple(step.name for step in STEPS)
+NAMES: Final = tuple(step.key for step in STEPS)
 
 
 def arguments() -> argparse.Namespace:
@@ -31,7 +31,7 @@ def arguments() -> argparse.Namespace:
 
 def main() -> int:
     options = arguments()
-    steps = [step for step in STEPS if options.only is None or step.name in options.only]
+    steps = [step for step in STEPS if options.only is None or step.key in options.only]
     out = options.out.resolve()
     folder = out / "results"
     try:

@@ -1,6 +1,6 @@
 """What the paper claims, and whether our runs bear it out."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Sequence
 from enum import StrEnum
 from typing import Any, Final, NamedTuple
 
@@ -45,13 +45,16 @@ class Claim(NamedTuple):
 class Figures:
     """The figures of all steps."""
 
-    def __init__(self, results: Mapping[str, Result]) -> None:
-        self._results = results
+    def __init__(self, results: Sequence[Result]) -> None:
+        self._results: dict[str, list[Result]] = {}
+        for result in results:
+            self._results.setdefault(result.step.name, []).append(result)
 
     def rows(self, step: str) -> list[dict[str, Any]]:
-        """Those of a step; empty where it was left out or failed."""
-        result = self._results.get(step)
-        return [] if result is None or result.found is None else list(result.found["rows"])
+        """Those of a benchmark; empty where it was left out or failed."""
+        return [
+            row for result in self._results.get(step, ()) if result.found is not None for row in result.found["rows"]
+        ]
 
     def row(self, step: str, case: str, system: str) -> dict[str, Any]:
         """The first whose case begins so. Raises MissingFigure."""
@@ -61,11 +64,12 @@ class Figures:
         raise MissingFigure(self.why(step))
 
     def why(self, step: str) -> str:
-        """Why a step has no figure that is asked for."""
-        result = self._results.get(step)
-        if result is None:
+        """Why a benchmark has no figure that is asked for."""
+        results = self._results.get(step)
+        if results is None:
             return f"{step} was not run"
-        return result.why or f"{result.step.title}: no such figure"
+        reasons = [result.why for result in results if result.why]
+        return reasons[0] if reasons else f"{results[0].step.title}: no such figure"
 
 
 class MissingFigure(Exception):  # noqa: N818  it is no error: a claim cannot be told
@@ -252,9 +256,8 @@ CLAIMS: Final[tuple[tuple[str, str, Callable[[Figures], tuple[bool, str]]], ...]
 )
 
 
-def claims(results: Mapping[str, Result]) -> Iterator[Claim]:
+def claims(figures: Figures) -> Iterator[Claim]:
     """All of them, in the paper's order."""
-    figures = Figures(results)
     for text, where, judge in CLAIMS:
         try:
             true, why = judge(figures)

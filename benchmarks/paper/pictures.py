@@ -8,6 +8,7 @@ from typing import Any, Final
 from benchmarks.common import pyplot
 from benchmarks.paper.claims import Figures
 from benchmarks.paper.published import BEGIN_S, END_S
+from benchmarks.paper.tables import SYSTEMS
 
 METRICS: Final = {
     "latency_ms": "latency, ms",
@@ -30,7 +31,13 @@ def scalability(plt: Any, figures: Figures) -> Any:
             for system, colour in COLOURS.items():
                 rows = [row for row in found if row["case"].endswith(case) and row["system"] == system]
                 points = sorted((int(row["case"].split()[0]), float(row[metric])) for row in rows)
-                axes.plot(*zip(*points, strict=True), marker="o", markersize=3, color=colour, label=system)
+                axes.plot(
+                    *zip(*points, strict=True),
+                    marker="o",
+                    markersize=3,
+                    color=colour,
+                    label=SYSTEMS.get(system, system),
+                )
             if metric == "latency_ms" and case.endswith("full link"):
                 axes.set(yscale="log")
             else:

@@ -23,8 +23,7 @@ PRINT_S: Final = 120.0
 
 def html(results: Sequence[Result], folder: Path, *, quick: bool) -> str:
     """The whole page."""
-    by_name = {result.step.name: result for result in results}
-    figures = Figures(by_name)
+    figures = Figures(results)
     drawn, not_drawn = {}, ""
     try:
         drawn = dict(pictures(figures))
@@ -36,7 +35,7 @@ def html(results: Sequence[Result], folder: Path, *, quick: bool) -> str:
     return environment.get_template("report.html.j2").render(
         kind="Quick" if quick else "Full",
         made=_made(results),
-        claims=list(claims(by_name)),
+        claims=list(claims(figures)),
         sections=list(sections(figures, folder)),
         pictures=drawn,
         not_drawn=not_drawn,

@@ -61,7 +61,7 @@ def command(step: Step, folder: Path, *, quick: bool) -> list[str]:
 def kept(step: Step, folder: Path, *, quick: bool) -> Result | None:
     """What an earlier run of the same code by the same command has found; None: nothing. ConfigError for a file that
     is none of ours."""
-    path = folder / f"{step.name}.json"
+    path = folder / f"{step.key}.json"
     if not path.exists():
         return None
     try:
@@ -74,8 +74,8 @@ def kept(step: Step, folder: Path, *, quick: bool) -> Result | None:
 
 
 def keep(result: Result, folder: Path) -> None:
-    told = {**result._asdict(), "step": result.step.name, "code": code(result.step.runs)}
-    path = folder / f"{result.step.name}.json"
+    told = {**result._asdict(), "step": result.step.key, "code": code(result.step.runs)}
+    path = folder / f"{result.step.key}.json"
     part = path.with_suffix(".part")
     part.write_text(json.dumps(told) + "\n", encoding="utf-8")
     part.replace(path)  # whole, or not at all
@@ -86,7 +86,7 @@ def run(step: Step, folder: Path, *, quick: bool) -> Result:
     if why := step.missing():
         return Result(step, why=why)
     words = command(step, folder, quick=quick)
-    wrote, log = folder / f"{step.name}.found.json", folder / f"{step.name}.log"
+    wrote, log = folder / f"{step.key}.found.json", folder / f"{step.key}.log"
     wrote.unlink(missing_ok=True)
     of, began_s = commit(), time.monotonic()
     with log.open("w", encoding="utf-8") as stream:

@@ -9,6 +9,7 @@ from typing import Final, NamedTuple
 
 from benchmarks.common import MissingError
 from benchmarks.endpoints import ros1
+from benchmarks.paper import published
 from sern_tools.checkout import code
 
 EVERYTHING: Final = ("sern_*", "benchmarks", ":(exclude)benchmarks/paper", "constraints.txt")
@@ -43,6 +44,13 @@ class Step(NamedTuple):
     missing: Callable[[], str] = str
     runs: Sequence[str] = EVERYTHING
     """The code that it runs: what was found holds until that changes."""
+    part: str = ""
+    """Of a benchmark that has several steps: an interrupted run loses less."""
+
+    @property
+    def key(self) -> str:
+        """Its name among all steps, and in those of files."""
+        return f"{self.name}_{self.part}" if self.part else self.name
 
     def arguments(self, folder: Path, *, quick: bool) -> list[str]:
         """Those of `python -m benchmarks.NAME`."""
@@ -90,13 +98,17 @@ def scaling_needs() -> str:
 
 
 STEPS: Final = (
-    Step(
-        "scaling",
-        "more and more robots over the lab's link",
-        (),
-        ("--quick", "--sizes", "small"),
-        (45, 2),
-        scaling_needs,
+    *(
+        Step(
+            "scaling",
+            f"more and more robots over the lab's link, {size} clouds",
+            ("--sizes", size),
+            ("--quick", "--sizes", size),
+            (22, 2),
+            scaling_needs,
+            part=size,
+        )
+        for size in ("small", "large")
     ),
     Step("sync", "the twin in virtual time", (), ("--quick",), (6, 1), _TWIN),
     Step("sync_lab", "the twin over the lab's link", (), ("--quick",), (16, 2), lab),
@@ -111,5 +123,16 @@ STEPS: Final = (
         ("benchmarks/navigation", *DRIVEN),
     ),
     Step("mmcf", "policies in virtual time", ("--seeds", "20"), ("--quick",), (10, 1)),
-    Step("mmcf_lab", "policies over the lab's link", ("--runs", "20", "--seconds", "18"), ("--quick",), (55, 4), lab),
+    *(
+        Step(
+            "mmcf_lab",
+            f"policies over the lab's link, {profile}",
+            ("--runs", "20", "--seconds", "18", "--profiles", profile),
+            ("--quick", "--profiles", profile),
+            (28, 2),
+            lab,
+            part=profile,
+        )
+        for profile in published.BREAKDOWN
+    ),
 )

@@ -22,7 +22,7 @@ from benchmarks.paper.tables import sections
 from sern_core.vocabulary.errors import ConfigError, SernError
 from sern_tools.checkout import ROOT
 
-BY_NAME = {step.name: step for step in STEPS}
+BY_NAME = {step.name: step for step in reversed(STEPS)}
 
 
 def result(name: str, *rows: dict[str, Any]) -> Result:
@@ -145,7 +145,7 @@ def test_each_erratum_says_where_and_what() -> None:
 
 
 def test_claims_are_judged_by_figures() -> None:
-    told = {claim.text: claim for claim in claims(everything())}
+    told = {claim.text: claim for claim in claims(Figures(list(everything().values())))}
     no = [text for text, claim in told.items() if claim.holds is Holds.NO]
     assert no == ["After 30 s without a link, going on with the last control inputs, it is about 5 cm off."]
     unknown = [claim for claim in told.values() if claim.holds is Holds.UNKNOWN]
@@ -153,17 +153,31 @@ def test_claims_are_judged_by_figures() -> None:
 
 
 def test_nothing_can_be_told_of_what_was_not_run() -> None:
-    assert {claim.holds for claim in claims({})} == {Holds.UNKNOWN}
+    assert {claim.holds for claim in claims(Figures([]))} == {Holds.UNKNOWN}
 
 
 def test_every_table_of_the_paper_has_its_section(tmp_path: Path) -> None:
-    found = {section.label: section for section in sections(Figures(everything()), tmp_path)}
+    found = {section.label: section for section in sections(Figures(list(everything().values())), tmp_path)}
     assert {"tab:sync_summary", "tab:baselines", "tab:mmcf_eval", "tab:mmcf_breakdown"} <= found.keys()
     assert len(found["tab:sync_summary"].rows) == len(GAPS) + 2
     assert [cells[0] for cells in found["tab:baselines"].rows] == [mode for mode in MODES for _ in range(2)]
     assert found["tab:mmcf_eval"].rows[0] == ("teleoperation", "Fixed Throughput", "0.43", "–", "0.430")
     for section in found.values():
         assert section.why or all(len(cells) == len(section.headings) for cells in section.rows)
+
+
+def test_steps_of_one_benchmark_are_one_table() -> None:
+    parts = [each for each in STEPS if each.name == "scaling"]
+    assert [each.key for each in parts] == ["scaling_small", "scaling_large"]
+    small, large = (
+        Result(each, {"rows": [row(f"2 robots, {each.part} clouds, idle link", "sern", latency_ms=1.0)], "notes": []})
+        for each in parts
+    )
+    assert [each["case"] for each in Figures([small, large]).rows("scaling")] == [
+        "2 robots, small clouds, idle link", "2 robots, large clouds, idle link"
+    ]  # fmt: skip
+    failed = Result(parts[1], why="exit status 1", failed=True)
+    assert Figures([small, failed]).why("scaling") == "exit status 1"
 
 
 def test_as_many_trials_as_the_paper_has_are_a_row_of_their_own(tmp_path: Path) -> None:
@@ -173,7 +187,9 @@ def test_as_many_trials_as_the_paper_has_are_a_row_of_their_own(tmp_path: Path) 
         for mode in MODES for seed in range(25)
     ]  # fmt: skip
     kept_drives(tmp_path).write_text("".join(json.dumps(each) + "\n" for each in drives))
-    found = {section.label: section for section in sections(Figures(everything()), tmp_path)}["tab:baselines"]
+    found = {section.label: section for section in sections(Figures(list(everything().values())), tmp_path)}[
+        "tab:baselines"
+    ]
     small = [cells for cells in found.rows if cells[1] == "the first 20 campuses"]
     assert [cells[0] for cells in small] == list(MODES)
     assert small[0][2:] == ("85.0 (64.0 to 94.8)", "68.0", "1.00")
@@ -281,6 +297,6 @@ def test_a_file_that_is_no_result_is_an_error_of_one_line(tmp_path: Path) -> Non
 def test_the_command_tells_what_it_knows() -> None:
     words = [sys.executable, "-m", "benchmarks.paper"]
     helped = subprocess.run([*words, "--help"], capture_output=True, text=True, check=True)
-    assert all(each.name in helped.stdout for each in STEPS)
+    assert all(each.key in helped.stdout for each in STEPS)
     wrong = subprocess.run([*words, "--only", "nothing"], capture_output=True, text=True, check=False)
     assert wrong.returncode == 2 and "invalid choice: 'nothing'" in wrong.stderr
