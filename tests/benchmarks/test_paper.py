@@ -42,6 +42,10 @@ def everything() -> dict[str, Result]:
         row(SYNC_BLACKOUT, "last command", median_cm=1874.0, p95_deg=177.0, bound_m=120.0, within_bound_percent=100.0),
         row(SYNC_BLACKOUT, "fixed gains, no prediction", median_cm=1823.0, p95_deg=93.0),
         row(SYNC_BLACKOUT, "constant twist", median_cm=1839.0, p95_deg=82.0, bound_m=120.0, within_bound_percent=100.0),
+        *(
+            row("stop in the gap", f"{before} s before its end", snapped_percent=0.0, back_s=2.0, correction_mps=0.5)
+            for before in ("0.5", "1", "2")
+        ),
         row(
             "bound",
             "ā holds",
@@ -150,6 +154,27 @@ def test_claims_are_judged_by_figures() -> None:
     assert no == ["After 30 s without a link, going on with the last control inputs, it is about 5 cm off."]
     unknown = [claim for claim in told.values() if claim.holds is Holds.UNKNOWN]
     assert [claim.why for claim in unknown] == ["the lab's link needs root: sudo make paper"]
+
+
+def test_a_load_that_grows_faster_is_no_gradual_one() -> None:
+    results = everything()
+    found = results["scaling"].found
+    assert found is not None
+    case = "5 robots, small clouds, idle link"
+    next(each for each in found["rows"] if (each["case"], each["system"]) == (case, "sern"))["far_percent"] += 1.0
+    told = {claim.text: claim for claim in claims(Figures(list(results.values())))}
+    claim = told["CPU rises more gradually with the number of robots."]
+    assert claim.holds is Holds.NO and "small clouds, idle link: +1 against +0 % of a core" in claim.why
+
+
+def test_with_one_number_of_robots_nothing_can_be_told_of_growth() -> None:
+    rows = [
+        row("2 robots, small clouds, idle link", system, latency_ms=1.0, far_percent=1.0, far_MB=1.0)
+        for system in ("sern", "tcpros")
+    ]
+    told = {claim.text: claim for claim in claims(Figures([result("scaling", *rows)]))}
+    assert told["So does memory."].holds is Holds.UNKNOWN
+    assert "one number of robots" in told["So does memory."].why
 
 
 def test_nothing_can_be_told_of_what_was_not_run() -> None:
