@@ -71,7 +71,7 @@ ALL: Final[Mapping[str, tuple[str, Callable[[Any, Figures], Any]]]] = {
     "fig:aurora_comparison_agents": ("scaling", scalability),
     "fig:runtime_reconfig_demo": ("reconfiguration", reconfiguration),
 }
-"""By the paper's label: the step that it is drawn from, and how."""
+"""The step that a figure is drawn from, and how, by the paper's label."""
 
 
 def pictures(figures: Figures) -> Iterator[tuple[str, str]]:

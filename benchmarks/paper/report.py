@@ -45,7 +45,7 @@ def html(results: Sequence[Result], folder: Path, *, quick: bool) -> str:
 
 
 def _made(results: Sequence[Result]) -> str:
-    """Of which commits and where, in words; parts say it for themselves where they differ."""
+    """The commits and machines of the runs, in words; parts name their own commit where these differ."""
     commits = list(dict.fromkeys(result.commit for result in results if result.commit)) or [commit()]
     machines = list(dict.fromkeys(result.machine for result in results if result.machine)) or [machine()]
     of = f"commit {commits[0]}" if len(commits) == 1 else f"commits {', '.join(commits)}, which differ in other code"

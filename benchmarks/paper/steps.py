@@ -45,7 +45,7 @@ class Step(NamedTuple):
     runs: Sequence[str] = EVERYTHING
     """The code that it runs: what was found holds until that changes."""
     part: str = ""
-    """Of a benchmark that has several steps: an interrupted run loses less."""
+    """Which part of its benchmark this is, where that has several steps so that an interrupted run loses less."""
 
     @property
     def key(self) -> str:

@@ -1,4 +1,4 @@
-"""In how many gaps the paper's bounds are kept, and what they say: eq. (gap_bound), Proposition finite_horizon_gap."""
+"""The paper's bounds, and in how many gaps they are kept: eq. (gap_bound), Proposition finite_horizon_gap."""
 
 import math
 from random import Random
@@ -13,7 +13,7 @@ from sern_twin.predictors import ConstantTwist
 from sern_twin.synchroniser import Synchroniser, SynchroniserOptions
 
 START_ERROR: Final = 0.001
-"""Of position [m] and of speed [m/s]."""
+"""How far off position [m] and speed [m/s] are known to be at most when a gap begins."""
 STATE_CONSTANT, INPUT_CONSTANT = 1.0, 1.0
 """L_x [1/s] and L_u of a state of position and speed whose input is the acceleration."""
 ONE_WAY_TIMES: Final = 3.0
