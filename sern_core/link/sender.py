@@ -184,9 +184,12 @@ class Sender:
             size_bytes *= codec.ratio
         spec = channel.spec
         since_s = out.message.born_s
-        if channel.coalesced and channel.last_sent_s is not None:
-            # With message age each new sample would reset the priority, and the topic could starve.
-            since_s = channel.last_sent_s
+        if channel.coalesced:
+            # With message age each new sample would reset the priority, and the topic could starve: also one of which
+            # nothing was sent yet, beside others of its rate.
+            if channel.waits_since_s is None:
+                channel.waits_since_s = since_s
+            since_s = channel.waits_since_s
         channel.offered = True
         self._end.dirty = True
         self.scheduler.offer(

@@ -39,7 +39,6 @@ class OutChannel:
         "codec",
         "counters",
         "drops",
-        "last_sent_s",
         "offered",
         "probe_seq",
         "ready",
@@ -47,6 +46,7 @@ class OutChannel:
         "required",
         "spec",
         "stream",
+        "waits_since_s",
         "wanted",
     )
 
@@ -72,8 +72,8 @@ class OutChannel:
         self._transit = Transit(coded=codec is not None)
         self._all = KeepAll(spec, self._transit, self.drops, first=first) if spec.reliable else None
         self._kept = self._all or KeepLast(spec, self._transit, self.drops, first=first)
-        self.last_sent_s: float | None = None
-        """When a message began last."""
+        self.waits_since_s: float | None = None
+        """When a message began last; before the first one, when the first that waited was born."""
         self.wanted: bool | None = None
         """Whether anybody behind the peer wants the stream; None until it has answered."""
         self.ready = False
@@ -235,7 +235,7 @@ class OutChannel:
     def begin(self, out: OutMessage, now: float) -> None:
         """`out` was the head of the queue and its first bytes leave now, or once its body is encoded."""
         self._transit.begin(out)
-        self.last_sent_s = now
+        self.waits_since_s = now
 
     def take(self, out: OutMessage, room: int, now: float) -> tuple[int, int]:
         """Cut the next fragment of at most `room` body bytes: (start, end). The caller puts it on the wire."""
@@ -255,7 +255,7 @@ class OutChannel:
                 del out.ranges[0]
         if not out.started:
             self._transit.begin(out)
-            self.last_sent_s = now
+            self.waits_since_s = now
         elif not out.ranges:
             self._transit.deactivate(out)
         out.fragments_inflight += 1

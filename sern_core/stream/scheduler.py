@@ -232,7 +232,8 @@ class Scheduler:
         """The channel has a pending message: a new head, or less of the same one left to send.
 
         `weight` is κ(t), `size_bytes` the remaining size s(m) (an estimate will do). Age counts from `since_s`: the
-        message's birth, or for a coalesced topic the time the topic was last sent; not later than the next `pick`.
+        message's birth, or for a coalesced topic the time since which it waits (`OutChannel.waits_since_s`); not later
+        than the next `pick`.
         `stale_after_s` (ordering `paper`) is the age above which a message of class bulk may be reported as stale.
         `background`, the same for a channel's whole life: it is served only while nothing else waits.
         In ordering `paper` an offer with the same `since_s` and no larger size continues the same message.

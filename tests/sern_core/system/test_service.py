@@ -401,3 +401,25 @@ def test_nothing_grows_while_clients_come_and_go() -> None:
         assert link.lane.flight.inflight_bytes < 100_000 and len(link.lane.flight.packets) < 500
         assert all(len(channel.retained) < 200 for channel in link.sender.channels.values())
     assert len(world.relay.hub.links) == 2 and not world.relay.hub.streams.draining
+
+
+@pytest.mark.parametrize("depth", [1, 2, 5])
+@pytest.mark.parametrize("downlink", [False, True])
+def test_robots_of_one_rate_all_get_through_a_full_link(depth: int, downlink: bool) -> None:
+    """Five robots send the same at the same rate, one after the other, over a link that carries six tenths of it. Whose
+    sample is always the youngest is replaced by its next one before its turn comes, unless the topic's wait counts."""
+    size, period_s, count = 10_000, 0.05, 5
+    thin = LinkModel(rate_bps=0.6 * 8 * size * count / period_s, delay_s=0.005).as_stream()
+    for start in range(8):
+        world = World().watch()
+        robot = world.client("robot", None if downlink else thin)
+        site = world.client("site", thin if downlink else None, patterns=["/robot/.*"])
+        topics = [f"/robot/{number}" for number in range(count)]
+        channels = [robot.publish(topic, spec(PriorityClass.STATE, depth=depth)) for topic in topics]
+        world.run(2.0)
+        for number, channel in enumerate(channels):
+            first_s = 0.001 * start + number * period_s / (count + 0.5)
+            robot.every(period_s, channel, bytes(size), first_s=first_s)
+        world.run(6.0)
+        got = [len(site.on(topic)) for topic in topics]
+        assert min(got) >= 0.5 * max(got), f"started {start} ms later: {got}"
