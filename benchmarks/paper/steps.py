@@ -104,7 +104,7 @@ STEPS: Final = (
             f"more and more robots over the lab's link, {size} clouds",
             ("--sizes", size),
             ("--quick", "--sizes", size),
-            (22, 2),
+            (32, 2),
             scaling_needs,
             part=size,
         )
@@ -118,7 +118,7 @@ STEPS: Final = (
         "three modes of navigation",
         ("modes", "--seeds", str(SEEDS), "--resume", "{drives}"),
         ("modes", "--seeds", "4", "--resume", "{drives}"),
-        (100, 3),
+        (75, 3),
         _TWIN,
         ("benchmarks/navigation", *DRIVEN),
     ),
