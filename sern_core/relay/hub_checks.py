@@ -40,7 +40,7 @@ def check_channels(streams: RelayedStreams, links: Mapping[ClientName, Link], ot
 
 
 def taken(streams: RelayedStreams, local_owners: Container[ClientName]) -> dict[ClientName, Counter[ClientName]]:
-    """By client, how many streams it takes of whom, without those of the relay itself."""
+    """How many streams each client takes, by who they are of; those of the relay itself are left out."""
     counts: dict[ClientName, Counter[ClientName]] = defaultdict(Counter)
     for identity, relayed in streams.by_id.items():
         for client in relayed.outs if identity.origin not in local_owners else ():
