@@ -6,6 +6,7 @@ where it was. What is missing here, as root, ROS 1 or an extra, leaves out its p
 """
 
 import argparse
+import signal
 import sys
 from pathlib import Path
 from typing import Final
@@ -32,6 +33,7 @@ def arguments() -> argparse.Namespace:
 def main() -> int:
     options = arguments()
     steps = [step for step in STEPS if options.only is None or step.key in options.only]
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # an end as by Ctrl-C, with what it runs
     out = options.out.resolve()
     folder = out / "results"
     try:

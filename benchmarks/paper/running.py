@@ -1,4 +1,4 @@
-"""Runs the steps, one after the other, and keeps what each of them found."""
+"""Runs the steps, and keeps what each of them found."""
 
 import json
 import os
@@ -7,11 +7,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Event
 from typing import Any, Final, NamedTuple
 
 from benchmarks.child import environment
-from benchmarks.paper.steps import Step
+from benchmarks.paper.steps import Company, Step
 from sern_core.vocabulary.errors import ConfigError
 from sern_tools.checkout import ROOT, code, commit
 from sern_tools.harness.processes import last_words
@@ -81,8 +83,9 @@ def keep(result: Result, folder: Path) -> None:
     part.replace(path)  # whole, or not at all
 
 
-def run(step: Step, folder: Path, *, quick: bool) -> Result:
-    """Run a step; KeyboardInterrupt ends it."""
+def run(step: Step, folder: Path, *, quick: bool, ends: Event | None = None) -> Result:
+    """Run a step; KeyboardInterrupt, or that `ends` is set, ends it. With `ends` it is in the background: it has what
+    others leave of the processors, and says nothing while it goes on."""
     if why := step.missing():
         return Result(step, why=why)
     words = command(step, folder, quick=quick)
@@ -95,7 +98,12 @@ def run(step: Step, folder: Path, *, quick: bool) -> Result:
             stdout=stream, stderr=stream, stdin=subprocess.DEVNULL, cwd=ROOT, env={**os.environ, **environment()},
         )  # fmt: skip
         try:
-            _wait(process, step.title, began_s)
+            if ends is None:
+                _wait(process, step.title, began_s)
+            else:
+                os.sched_setscheduler(process.pid, os.SCHED_IDLE, os.sched_param(0))
+                while process.poll() is None and not ends.wait(LOOK_S):
+                    pass
         finally:
             if process.poll() is None:
                 process.terminate()
@@ -125,20 +133,45 @@ def _wait(process: "subprocess.Popen[bytes]", title: str, began_s: float) -> Non
 
 def run_all(steps: Sequence[Step], folder: Path, *, quick: bool) -> list[Result]:
     """All of them; those that an earlier run of the same code has are taken as they are, but for what failed or was
-    left out, which is tried again."""
+    left out, which is tried again. What needs no processor of its own runs in the background, beside what may have
+    company."""
     folder.mkdir(parents=True, exist_ok=True)
-    results = []
-    for number, step in enumerate(steps, 1):
-        known = kept(step, folder, quick=quick)
-        head = f"[{number}/{len(steps)}] {step.title}"
-        if known is not None and known.found is not None:
-            print(f"{head}: from an earlier run, of commit {known.commit}", file=sys.stderr)
-            results.append(known)
-            continue
-        print(f"{head}: about {step.minutes[quick]} minutes", file=sys.stderr, flush=True)
-        result = run(step, folder, quick=quick)
-        if result.why:
-            print(f"  {'failed' if result.failed else 'left out'}: {result.why}", file=sys.stderr)
-        keep(result, folder)
-        results.append(result)
-    return results
+    heads = {step.key: f"[{number}/{len(steps)}] {step.title}" for number, step in enumerate(steps, 1)}
+    found: dict[str, Result] = {}
+
+    def have(company: Company, ends: Event | None = None) -> None:
+        for step in steps:
+            if step.company is company and not (ends is not None and ends.is_set()):
+                result = _have(step, heads[step.key], folder, quick=quick, ends=ends)
+                if ends is None or not ends.is_set():
+                    found[step.key] = result
+
+    have(Company.NONE)
+    ends = Event()
+    with ThreadPoolExecutor(1) as pool:
+        try:
+            background = pool.submit(have, Company.ANY, ends)
+            have(Company.BACKGROUND)
+            background.result()
+        finally:
+            ends.set()  # it is over, or was interrupted
+    return [found[step.key] for step in steps]
+
+
+def _have(step: Step, head: str, folder: Path, *, quick: bool, ends: Event | None) -> Result:
+    """What an earlier run has of a step, or what comes of it now."""
+    known = kept(step, folder, quick=quick)
+    if known is not None and known.found is not None:
+        print(f"{head}: from an earlier run, of commit {known.commit}", file=sys.stderr)
+        return known
+    beside = "" if ends is None else ", in the background"
+    print(f"{head}: about {step.minutes[quick]} minutes{beside}", file=sys.stderr, flush=True)
+    result = run(step, folder, quick=quick, ends=ends)
+    if ends is not None and ends.is_set():
+        return result
+    if result.why:
+        print(f"{head}: {'failed' if result.failed else 'left out'}: {result.why}", file=sys.stderr)
+    elif ends is not None:
+        print(f"{head}: done, {result.took_s / 60:.0f} minutes", file=sys.stderr)
+    keep(result, folder)
+    return result

@@ -4,6 +4,7 @@ import importlib.util
 import os
 import shutil
 from collections.abc import Callable, Sequence
+from enum import Enum
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -32,6 +33,14 @@ SEEDS: Final = 400
 LAB_PACKAGES: Final = {"qemu-system-x86_64": "qemu-system-x86", "busybox": "busybox-static", "ip": "iproute2"}
 
 
+class Company(Enum):
+    """What may run beside a step."""
+
+    NONE = "nothing: it compares what takes processors"
+    BACKGROUND = "what is in the background: it has real-time priority"
+    ANY = "anything: it runs in virtual time, in the background, on what is left of the processors"
+
+
 class Step(NamedTuple):
     """A benchmark that writes a result. `full` and `quick` are its arguments, with `{drives}` for the file of
     drives; `minutes` for each, on two cores; `missing` says what it lacks here and what to do, or nothing."""
@@ -46,6 +55,7 @@ class Step(NamedTuple):
     """The code that it runs: what was found holds until that changes."""
     part: str = ""
     """Which part of its benchmark this is, where that has several steps so that an interrupted run loses less."""
+    company: Company = Company.NONE
 
     @property
     def key(self) -> str:
@@ -110,9 +120,17 @@ STEPS: Final = (
         )
         for size in ("small", "large")
     ),
-    Step("sync", "the twin in virtual time", (), ("--quick",), (6, 1), _TWIN),
-    Step("sync_lab", "the twin over the lab's link", (), ("--quick",), (16, 2), lab),
-    Step("reconfiguration", "a stream that comes and goes", (), ("--quick",), (8, 1), masters),
+    Step("sync", "the twin in virtual time", (), ("--quick",), (6, 1), _TWIN, company=Company.ANY),
+    Step("sync_lab", "the twin over the lab's link", (), ("--quick",), (16, 2), lab, company=Company.BACKGROUND),
+    Step(
+        "reconfiguration",
+        "a stream that comes and goes",
+        (),
+        ("--quick",),
+        (8, 1),
+        masters,
+        company=Company.BACKGROUND,
+    ),
     Step(
         "navigation",
         "three modes of navigation",
@@ -121,8 +139,9 @@ STEPS: Final = (
         (75, 3),
         _TWIN,
         ("benchmarks/navigation", *DRIVEN),
+        company=Company.ANY,
     ),
-    Step("mmcf", "policies in virtual time", ("--seeds", "20"), ("--quick",), (10, 1)),
+    Step("mmcf", "policies in virtual time", ("--seeds", "20"), ("--quick",), (30, 1), company=Company.ANY),
     *(
         Step(
             "mmcf_lab",
@@ -132,6 +151,7 @@ STEPS: Final = (
             (28, 2),
             lab,
             part=profile,
+            company=Company.BACKGROUND,
         )
         for profile in published.BREAKDOWN
     ),

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from benchmarks.paper import errata, report, running, steps
 from benchmarks.paper.claims import RECONFIGURED, SYNC_BLACKOUT, SYNC_MODERATE, Figures, Holds, claims
 from benchmarks.paper.published import BREAKDOWN, GAPS, MODES, POLICIES
 from benchmarks.paper.running import Result, kept, run, run_all
-from benchmarks.paper.steps import STEPS, Step
+from benchmarks.paper.steps import STEPS, Company, Step
 from benchmarks.paper.steps import drives as kept_drives
 from benchmarks.paper.tables import sections
 from sern_core.vocabulary.errors import ConfigError, SernError
@@ -256,8 +257,8 @@ def test_without_a_browser_it_says_what_to_install(tmp_path: Path, monkeypatch: 
 # --- how it is run ------------------------------------------------------------------------------------------------
 
 
-def step(name: str, missing: str = "") -> Step:
-    return Step(name, f"the step {name}", (), ("--quick",), (1, 1), lambda: missing)
+def step(name: str, missing: str = "", company: Company = Company.NONE) -> Step:
+    return Step(name, f"the step {name}", (), ("--quick",), (1, 1), lambda: missing, company=company)
 
 
 def test_what_a_step_lacks_leaves_it_out(tmp_path: Path) -> None:
@@ -273,6 +274,62 @@ def test_a_step_that_fails_is_told_with_its_last_words_and_the_rest_goes_on(
     assert results[1].why == "it is left out"
     told = capsys.readouterr().err
     assert "[1/2]" in told and "failed: exit status 1" in told and "left out: it is left out" in told
+
+
+def test_only_what_may_have_company_runs_beside_something(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The report has them in its own order all the same."""
+    began: list[str] = []
+    background, other = threading.Event(), threading.Event()
+
+    def played(step: Step, _folder: Path, *, quick: bool, ends: threading.Event | None = None) -> Result:
+        began.append(step.name)
+        assert quick and (ends is not None) == (step.company is Company.ANY)
+        if step.name == "virtual":
+            background.set()
+            assert other.wait(30.0), "it does not hold up the others"
+        if step.name == "lab":
+            assert background.wait(30.0)
+            other.set()
+        return Result(step, why="it was played", failed=True)
+
+    monkeypatch.setattr(running, "run", played)
+    chosen = [
+        step("virtual", company=Company.ANY),
+        step("lab", company=Company.BACKGROUND),
+        step("load"),
+    ]
+    assert [found.step.name for found in run_all(chosen, tmp_path, quick=True)] == ["virtual", "lab", "load"]
+    assert began[0] == "load"
+
+
+def test_an_interruption_ends_what_is_in_the_background(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    began, ended = threading.Event(), threading.Event()
+
+    def played(step: Step, _folder: Path, *, quick: bool, ends: threading.Event | None = None) -> Result:
+        if ends is None:
+            assert quick and began.wait(30.0)
+            raise KeyboardInterrupt
+        began.set()
+        assert ends.wait(30.0)
+        ended.set()
+        return Result(step, why="it was ended", failed=True)
+
+    monkeypatch.setattr(running, "run", played)
+    chosen = [
+        step("virtual", company=Company.ANY),
+        step("next", company=Company.ANY),
+        step("lab", company=Company.BACKGROUND),
+    ]
+    with pytest.raises(KeyboardInterrupt):
+        run_all(chosen, tmp_path, quick=True)
+    assert ended.is_set() and not list(tmp_path.glob("*.json")), "nothing of it is kept, and the next one never began"
+
+
+def test_what_is_in_the_background_is_ended_with_its_process(tmp_path: Path) -> None:
+    ends = threading.Event()
+    ends.set()
+    found = run(step("soak", company=Company.ANY), tmp_path, quick=True, ends=ends)
+    assert found.failed and "exit status" in found.why
 
 
 def test_what_is_done_is_not_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
