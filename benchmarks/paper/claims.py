@@ -23,6 +23,8 @@ PLANNED: Final = "shared trajectory"
 STOPPED: Final = "stop in the gap"
 SMOOTH_MPS: Final = 0.5
 """What a correction may add to the twin's speed: SERN's default."""
+ROUNDED: Final = 1.0 + 1e-9
+"""A speed that is limited is off by what its last digit is rounded."""
 BACK_1: Final = 0.1
 """How far off a load may be that is as before."""
 UNPREDICTED: Final = "fixed gains, no prediction"
@@ -163,7 +165,7 @@ def _time(figures: Figures) -> tuple[bool, str]:
 
 def _help(figures: Figures) -> tuple[bool, str]:
     helped = {mode: figures.row("navigation", "", mode)["interventions_run"] for mode in MODES}
-    text = ", ".join(f"{mode} {count:.2f}" for mode, count in helped.items())
+    text = ", ".join(f"{mode} {count:.3f}" for mode, count in helped.items())
     return min(helped, key=helped.__getitem__) == "SERN", f"a drive: {text}"
 
 
@@ -235,7 +237,7 @@ def _smooth(figures: Figures) -> tuple[bool, str]:
         f"after a stop that nobody foresaw, 2 s before the link returns, it is there again in "
         f"{rows[-1]['back_s']:.1f} s, corrected by {fastest:.2g} m/s at the most"
     )
-    return not any(row["snapped_percent"] for row in rows) and fastest <= SMOOTH_MPS, text
+    return not any(row["snapped_percent"] for row in rows) and fastest <= SMOOTH_MPS * ROUNDED, text
 
 
 def _load_back(figures: Figures) -> tuple[bool, str]:
