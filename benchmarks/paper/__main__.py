@@ -33,7 +33,8 @@ def arguments() -> argparse.Namespace:
 def main() -> int:
     options = arguments()
     steps = [step for step in STEPS if options.only is None or step.key in options.only]
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # an end as by Ctrl-C, with what it runs
+    for number in (signal.SIGINT, signal.SIGTERM):  # a shell's job in the background ignores the first
+        signal.signal(number, signal.default_int_handler)
     out = options.out.resolve()
     folder = out / "results"
     try:

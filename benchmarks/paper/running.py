@@ -3,11 +3,13 @@
 import json
 import os
 import platform
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from threading import Event
 from typing import Any, Final, NamedTuple
@@ -21,6 +23,8 @@ from sern_tools.harness.processes import last_words
 TOLD_S: Final = 60.0
 """How often a step that goes on is told of where nobody sees a line change."""
 LOOK_S: Final = 0.5
+END_S: Final = 20.0
+"""Time to take down a lab."""
 
 
 class Result(NamedTuple):
@@ -96,6 +100,7 @@ def run(step: Step, folder: Path, *, quick: bool, ends: Event | None = None) -> 
         process = subprocess.Popen(
             [sys.executable, *words[1:], "--json", str(wrote)],
             stdout=stream, stderr=stream, stdin=subprocess.DEVNULL, cwd=ROOT, env={**os.environ, **environment()},
+            start_new_session=True,
         )  # fmt: skip
         try:
             if ends is None:
@@ -106,8 +111,7 @@ def run(step: Step, folder: Path, *, quick: bool, ends: Event | None = None) -> 
                     pass
         finally:
             if process.poll() is None:
-                process.terminate()
-                process.wait()
+                end(process)
     how = (" ".join(words), time.monotonic() - began_s, of, machine())
     if process.returncode != 0 or not wrote.exists():
         words_left = last_words(log, from_traceback=True) or "it said nothing"
@@ -115,6 +119,16 @@ def run(step: Step, folder: Path, *, quick: bool, ends: Event | None = None) -> 
     found = json.loads(wrote.read_text(encoding="utf-8"))
     wrote.unlink()
     return Result(step, found, "" if found["rows"] else " ".join(found["notes"]), False, *how)
+
+
+def end(process: "subprocess.Popen[bytes]") -> None:
+    """End the leader of a session as Ctrl-C does, so that it takes down what it set up, and then what is left of it."""
+    os.killpg(process.pid, signal.SIGINT)
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(END_S)
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
 
 
 def _wait(process: "subprocess.Popen[bytes]", title: str, began_s: float) -> None:
@@ -143,7 +157,7 @@ def run_all(steps: Sequence[Step], folder: Path, *, quick: bool) -> list[Result]
         for step in steps:
             if step.company is company and not (ends is not None and ends.is_set()):
                 result = _have(step, heads[step.key], folder, quick=quick, ends=ends)
-                if ends is None or not ends.is_set():
+                if result is not None:
                     found[step.key] = result
 
     have(Company.NONE)
@@ -158,8 +172,8 @@ def run_all(steps: Sequence[Step], folder: Path, *, quick: bool) -> list[Result]
     return [found[step.key] for step in steps]
 
 
-def _have(step: Step, head: str, folder: Path, *, quick: bool, ends: Event | None) -> Result:
-    """What an earlier run has of a step, or what comes of it now."""
+def _have(step: Step, head: str, folder: Path, *, quick: bool, ends: Event | None) -> Result | None:
+    """What an earlier run has of a step, or what comes of it now; None: it was ended."""
     known = kept(step, folder, quick=quick)
     if known is not None and known.found is not None:
         print(f"{head}: from an earlier run, of commit {known.commit}", file=sys.stderr)
@@ -168,7 +182,7 @@ def _have(step: Step, head: str, folder: Path, *, quick: bool, ends: Event | Non
     print(f"{head}: about {step.minutes[quick]} minutes{beside}", file=sys.stderr, flush=True)
     result = run(step, folder, quick=quick, ends=ends)
     if ends is not None and ends.is_set():
-        return result
+        return None
     if result.why:
         print(f"{head}: {'failed' if result.failed else 'left out'}: {result.why}", file=sys.stderr)
     elif ends is not None:

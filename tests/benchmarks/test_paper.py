@@ -333,11 +333,12 @@ def test_an_interruption_ends_what_is_in_the_background(tmp_path: Path, monkeypa
     assert ended.is_set() and not list(tmp_path.glob("*.json")), "nothing of it is kept, and the next one never began"
 
 
-def test_what_is_in_the_background_is_ended_with_its_process(tmp_path: Path) -> None:
-    ends = threading.Event()
-    ends.set()
-    found = run(step("soak", company=Company.ANY), tmp_path, quick=True, ends=ends)
-    assert found.failed and "exit status" in found.why
+def test_what_a_step_has_started_ends_with_it() -> None:
+    command = ["sh", "-c", "sleep 1000 & echo on; wait"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True) as process:
+        assert process.stdout is not None and process.stdout.readline() == b"on\n"
+        running.end(process)
+        assert process.stdout.read() == b"", "nobody has it open any more"
 
 
 def test_what_is_done_is_not_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
