@@ -150,13 +150,14 @@ def run_all(steps: Sequence[Step], folder: Path, *, quick: bool) -> list[Result]
     left out, which is tried again. What needs no processor of its own runs in the background, beside what may have
     company."""
     folder.mkdir(parents=True, exist_ok=True)
+    known = {step.key: kept(step, folder, quick=quick) for step in steps}  # all of it first: one may be none of ours
     heads = {step.key: f"[{number}/{len(steps)}] {step.title}" for number, step in enumerate(steps, 1)}
     found: dict[str, Result] = {}
 
     def have(company: Company, ends: Event | None = None) -> None:
         for step in steps:
             if step.company is company and not (ends is not None and ends.is_set()):
-                result = _have(step, heads[step.key], folder, quick=quick, ends=ends)
+                result = _have(step, known[step.key], heads[step.key], folder, quick=quick, ends=ends)
                 if result is not None:
                     found[step.key] = result
 
@@ -172,9 +173,10 @@ def run_all(steps: Sequence[Step], folder: Path, *, quick: bool) -> list[Result]
     return [found[step.key] for step in steps]
 
 
-def _have(step: Step, head: str, folder: Path, *, quick: bool, ends: Event | None) -> Result | None:
+def _have(
+    step: Step, known: Result | None, head: str, folder: Path, *, quick: bool, ends: Event | None
+) -> Result | None:
     """What an earlier run has of a step, or what comes of it now; None: it was ended."""
-    known = kept(step, folder, quick=quick)
     if known is not None and known.found is not None:
         print(f"{head}: from an earlier run, of commit {known.commit}", file=sys.stderr)
         return known

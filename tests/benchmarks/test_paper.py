@@ -385,6 +385,16 @@ def test_a_file_that_is_no_result_is_an_error_of_one_line(tmp_path: Path) -> Non
         kept(BY_NAME["mmcf"], tmp_path, quick=True)
 
 
+def test_it_is_told_before_anything_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def played(step: Step, _folder: Path, *, quick: bool, ends: threading.Event | None = None) -> Result:
+        raise AssertionError(f"{step.name} ran for hours first, quick {quick}, {ends}")
+
+    monkeypatch.setattr(running, "run", played)
+    (tmp_path / "virtual.json").write_text("{}")
+    with pytest.raises(ConfigError, match=r"virtual.json is no result of a step"):
+        run_all([step("load"), step("virtual", company=Company.ANY)], tmp_path, quick=True)
+
+
 def test_the_command_tells_what_it_knows() -> None:
     words = [sys.executable, "-m", "benchmarks.paper"]
     helped = subprocess.run([*words, "--help"], capture_output=True, text=True, check=True)
