@@ -1,5 +1,6 @@
 """Writes the report: one page of HTML that needs nothing beside it, and the same as PDF."""
 
+import re
 import shutil
 import subprocess
 import tempfile
@@ -8,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup, escape
 
 from benchmarks.paper import errata
 from benchmarks.paper.claims import Figures, claims
@@ -32,6 +34,7 @@ def html(results: Sequence[Result], folder: Path, *, quick: bool) -> str:
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
+    environment.filters["names"] = _names
     return environment.get_template("report.html.j2").render(
         kind="Quick" if quick else "Full",
         made=_made(results),
@@ -42,6 +45,11 @@ def html(results: Sequence[Result], folder: Path, *, quick: bool) -> str:
         errata=list(errata.errata()),
         results=results,
     )
+
+
+def _names(text: str) -> Markup:
+    """Names of the code, which a sentence has in backticks."""
+    return Markup(re.sub("`(.*?)`", r"<code>\1</code>", str(escape(text))))
 
 
 def _made(results: Sequence[Result]) -> str:

@@ -240,6 +240,11 @@ def test_the_page_has_all_of_it_and_needs_nothing_else(tmp_path: Path) -> None:
     assert 'src="http' not in page and "<link" not in page
 
 
+def test_a_name_of_the_code_looks_like_one(tmp_path: Path) -> None:
+    page = report.html([], tmp_path, quick=True)
+    assert "(<code>plan_tracking</code>)" in page and "`" not in page
+
+
 def test_without_what_draws_the_page_says_so_and_has_the_rest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     page = report.html(list(everything().values()), tmp_path, quick=True)
