@@ -72,12 +72,12 @@ def synchronisation(figures: Figures, _folder: Path) -> Section:
     rows: Rows = []
     for gap, (case, system, which) in zip(GAPS, settings, strict=True):
         row = figures.row("sync", case, system)
-        ours = (f"{row[f'{which}_cm']:.1f} cm ({which})", f"{row['p95_deg']:.1f}° (p95)")
+        ours = (f"{_cm(row[f'{which}_cm'])} ({which})", f"{row['p95_deg']:.1f}° (p95)")
         rows.append((gap.setting, gap.method, gap.position, ours[0], gap.rotation, ours[1]))
     last = figures.row("sync", SYNC_BLACKOUT, "last command")
     rows.append(
         ("blackout 30 s", "last control inputs, as the text has it", "≈ 5 cm",
-         f"{last['median_cm']:,.0f} cm (median)", "< 3°", f"{last['p95_deg']:.0f}° (p95)")
+         f"{_cm(last['median_cm'])} (median)", "< 3°", f"{last['p95_deg']:.0f}° (p95)")
     )  # fmt: skip
     for each in figures.rows("sync_lab"):
         if each["system"] == "with the robot's plan":
@@ -87,7 +87,7 @@ def synchronisation(figures: Figures, _folder: Path) -> Section:
                     f"lab: {name}",
                     "SERN",
                     "< 5 cm",
-                    f"{each['p95_cm']:.1f} cm (p95)",
+                    f"{_cm(each['p95_cm'])} (p95)",
                     "< 2°",
                     f"{each['p95_deg']:.1f}° (p95)",
                 )
@@ -100,6 +100,11 @@ def synchronisation(figures: Figures, _folder: Path) -> Section:
         "SERN: robot and twin follow one trajectory over time, and the robot closes its loop on it. Rows of the lab "
         "are the installed daemons with keys over tc netem.",
     )
+
+
+def _cm(offset_cm: float) -> str:
+    """Tenths tell nothing of metres."""
+    return f"{offset_cm:.1f} cm" if offset_cm < 100.0 else f"{offset_cm:,.0f} cm"
 
 
 def _drives(path: Path) -> dict[str, list[dict[str, Any]]]:

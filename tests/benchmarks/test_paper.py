@@ -71,8 +71,8 @@ def everything() -> dict[str, Result]:
     modes = result(
         "navigation",
         *(
-            row("400 campuses, a twin", mode, success_percent=printed.success_percent, from_percent=60.0,
-                to_percent=99.0, time_median_s=printed.time_s, interventions_run=printed.interventions)
+            row("400 campuses, a twin", mode, success_percent=printed.success_percent, from_percent=printed.low_percent,
+                to_percent=printed.high_percent, time_median_s=printed.time_s, interventions_run=printed.interventions)
             for mode, printed in MODES.items()
         ),
     )  # fmt: skip
@@ -184,6 +184,36 @@ def test_with_one_number_of_robots_nothing_can_be_told_of_growth() -> None:
     told = {claim.text: claim for claim in claims(Figures([result("scaling", *rows)]))}
     assert told["So does memory."].holds is Holds.UNKNOWN
     assert "one number of robots" in told["So does memory."].why
+
+
+def drives_of(campuses: int, *, sern_from_percent: float) -> Figures:
+    figures = {"success_percent": 80.0, "time_median_s": 60.0, "interventions_run": 0.0}
+    return Figures(
+        [
+            result(
+                "navigation",
+                *(
+                    row(f"{campuses} campuses", mode, **figures, from_percent=low, to_percent=low + 10.0)
+                    for mode, low in zip(MODES, (75.0, 60.0, sern_from_percent), strict=True)
+                ),
+                row("where SERN and Sim Only both reach the goal", "SERN", time_median_s=59.0),
+            )
+        ]
+    )
+
+
+def test_of_few_campuses_nothing_can_be_told() -> None:
+    told = [claim for claim in claims(drives_of(4, sern_from_percent=90.0)) if claim.where == "tab:baselines"]
+    assert {claim.holds for claim in told} == {Holds.UNKNOWN}
+    assert {claim.why for claim in told} == {"it was measured on 4 campuses: a full run has more"}
+
+
+@pytest.mark.parametrize(("low", "holds"), [(86.0, Holds.YES), (80.0, Holds.UNKNOWN), (60.0, Holds.NO)])
+def test_success_is_compared_by_its_intervals(low: float, holds: Holds) -> None:
+    told = {claim.text: claim for claim in claims(drives_of(400, sern_from_percent=low))}
+    assert told["SERN reaches the goal most often."].holds is holds
+    assert told["SERN needs the least help."].holds is Holds.NO, "all need as much"
+    assert "where SERN and Sim Only both reach the goal: SERN 59.0 s" in told["SERN is the fastest there."].why
 
 
 def test_nothing_can_be_told_of_what_was_not_run() -> None:
