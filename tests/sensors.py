@@ -51,15 +51,15 @@ class FittedTopic:
             self.levels.append((self._robot.world.network.now, self.fit.level))
             self._robot.core.level_changed(self.channel, self.fit.level, now=self._robot.now)
         if level is SummaryLevel.RAW:
-            self.fit.sent(self.channel.next_seq)
+            self.fit.sent(self.channel.next_seq, len(self._whole))
         self._robot.send(self.channel, self._whole if level is SummaryLevel.RAW else self._thin)
 
 
 class Sensors:
     """A robot with those sensors at the near end of the link, and a site beside the relay."""
 
-    def __init__(self, *steps: RateStep) -> None:
-        self.world = World(lossless=False)
+    def __init__(self, *steps: RateStep, seed: int = 1) -> None:
+        self.world = World(lossless=False, seed=seed)
         self.robot = self.world.client("robot", replace(WIFI, rate_steps=steps), WIFI)
         self.site = self.world.client("site", patterns=["/robot/.*"])
         self._every(SCAN, PriorityClass.STATE, SCAN_BYTES)

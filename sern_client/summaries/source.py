@@ -138,7 +138,7 @@ class SummarisedTopic:
         """Send a message as `_pass` does, at the level that the link allows."""
         level = self._level(fit, clock.now())
         if level is SummaryLevel.RAW and not any(output.shares_topic for output in self.outputs):
-            fit.sent(self._channel.next_seq)
+            fit.sent(self._channel.next_seq, len(body))
             return self._raw(body, stamp_ns, born_s)
         accepted = [output.offer(body, stamp_ns, born_s, level) for output in self.outputs]
         return len(accepted) > 1 or accepted[0]

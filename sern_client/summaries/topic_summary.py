@@ -229,7 +229,7 @@ class TopicSummary:
     def _start(self, job: Job) -> bool:
         if self._maker is None and job.level is SummaryLevel.RAW:
             if self.fit is not None:
-                self.fit.sent(self.source.next_seq)
+                self.fit.sent(self.source.next_seq, len(job.body))
             return self._sends[0](job.body, job.stamp_ns, job.born_s)
         if len(job.body) <= INLINE_BYTES:
             return self._finish(job, self._run(job))

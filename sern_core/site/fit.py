@@ -1,10 +1,11 @@
 """Whether the messages of a topic fit the link, or their summary goes in their place. Pure.
 
 What became of the last messages decides: several in a row that were too large to arrive within their lifespan, and none
-that arrived. Summaries do not fill a link, so nobody would see that it has become a better one: now and then a message
-goes as it came, to see. When two of them in a row have arrived, all go so again. The pause between them grows while
-they are in vain and show no faster link, and where a topic has just gone back and forth, so that it does not go on
-doing so.
+that arrived. One that waits for its turn until a newer one takes its place says nothing, unless it was far too large
+for what the link carries. Summaries do not fill a link, so nobody would see that it has become a better one: now and
+then a message goes as it came, to see. When two of them in a row have arrived, all go so again. The pause between them
+grows while they are in vain and show no faster link, and where a topic has just gone back and forth, so that it does
+not go on doing so.
 """
 
 from collections.abc import Iterator
@@ -27,6 +28,9 @@ MAX_WATCHED: Final = 64
 """Messages whose fate is not known yet; of more, the oldest are not watched."""
 GROWS: Final = 1.1
 """The link is a faster one when it is known to carry so many times what it was before the last that was in vain."""
+FAR_TOO_LARGE: Final = 4.0
+"""A message is if it would take so many of its lifespans though it had all of the link; a codec seldom makes so little
+of it that it arrives."""
 TOO_LARGE: Final = frozenset({DropReason.TOO_SLOW, DropReason.LIFESPAN})
 """What the fate of a message is called that the link could not carry in time."""
 
@@ -40,6 +44,7 @@ class Fit:
     __slots__ = (
         "_arrivals",
         "_back_s",
+        "_carries_bps",
         "_channel",
         "_counted",
         "_due_s",
@@ -62,7 +67,8 @@ class Fit:
         self._channel = channel
         self._counted = channel.drops.on_count  # who else is told of what is dropped
         channel.drops.on_count = self._dropped
-        self._watched: dict[int, None] = {}  # seqs of messages that went as they came, of unknown fate
+        self._watched: dict[int, int] = {}  # sizes by seqs of messages that went as they came, of unknown fate
+        self._carries_bps: float | None = None
         self._misses = 0
         self._arrivals = 0
         self._probing = False  # a message that is to see has been chosen, and its fate is not known yet
@@ -78,6 +84,7 @@ class Fit:
 
     def choose(self, now: float, rate_bps: float | None) -> SummaryLevel:
         """What the message that comes now is sent as, while the link is known to carry `rate_bps`."""
+        self._carries_bps = rate_bps
         for seq in list(self._arrived()):
             del self._watched[seq]
             self._misses = 0
@@ -98,11 +105,11 @@ class Fit:
         self._probing, self._due_s, self._rate_bps = True, now, rate_bps or inf
         return SummaryLevel.RAW
 
-    def sent(self, seq: int) -> None:
-        """A message went to the channel as it came."""
+    def sent(self, seq: int, nbytes: int) -> None:
+        """A message of `nbytes` went to the channel as it came."""
         if len(self._watched) >= MAX_WATCHED:
             del self._watched[next(iter(self._watched))]
-        self._watched[seq] = None
+        self._watched[seq] = nbytes
         if self._probing:
             self._channel.probe_seq = seq
 
@@ -110,14 +117,20 @@ class Fit:
         """The channel counts a message as dropped, whichever."""
         if self._counted is not None:
             self._counted(seq, reason)
-        if seq not in self._watched:
+        nbytes = self._watched.pop(seq, None)
+        if nbytes is None:
             return
-        del self._watched[seq]
-        if reason in TOO_LARGE:
+        if reason in TOO_LARGE or (reason is DropReason.SUPERSEDED and self._far_too_large(nbytes)):
             self._misses += 1
         elif self.level is SummaryLevel.SUMMARY:
             self._probing = False  # it says nothing: another one has its turn
             self._due_s += MIN_PAUSE_S
+
+    def _far_too_large(self, nbytes: int) -> bool:
+        lifespan_s = self._channel.spec.lifespan_s
+        if lifespan_s is None or self._carries_bps is None:
+            return False
+        return 8 * nbytes > FAR_TOO_LARGE * lifespan_s * self._carries_bps
 
     def _arrived(self) -> Iterator[int]:
         """Those of which the other end has said that it has them whole."""

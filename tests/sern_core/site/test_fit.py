@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import pytest
 
-from sern_core.site.fit import MAX_PAUSE_S, MAX_WATCHED, MIN_PAUSE_S, MISSES, Fit
+from sern_core.site.fit import FAR_TOO_LARGE, MAX_PAUSE_S, MAX_WATCHED, MIN_PAUSE_S, MISSES, Fit
 from sern_core.stream.out_channel import OutChannel
 from sern_core.stream.out_message import OutMessage
 from sern_core.summaries.spec import SummaryLevel
@@ -89,10 +89,10 @@ class ByHand:
         self.channel: OutChannel = self.robot.publish(CLOUD, spec(PriorityClass.BULK, lifespan_s=1.0))
         self.fit = Fit(self.channel)
 
-    def whole(self, reason: DropReason | None) -> None:
+    def whole(self, reason: DropReason | None, nbytes: int = 1000) -> None:
         """One goes as it comes, and is dropped for a reason, or arrives."""
         seq = self.channel.next_seq
-        self.fit.sent(seq)
+        self.fit.sent(seq, nbytes)
         self.robot.send(self.channel, b"cloud")
         if reason is not None:
             self.channel.drop_head(reason, self.robot.now)
@@ -129,6 +129,18 @@ def test_what_says_nothing_of_the_link_changes_nothing(reason: DropReason) -> No
     hand.whole(reason)
     assert hand.fit.choose(probe_s + MIN_PAUSE_S - 0.1, RATE_BPS) is SUMMARY
     assert hand.fit.choose(probe_s + MIN_PAUSE_S, RATE_BPS) is RAW, "another one has its turn, and no later for it"
+
+
+@pytest.mark.parametrize(("times", "level"), [(0.9, RAW), (1.1, SUMMARY)])
+def test_what_waits_for_its_turn_in_vain_says_something_where_it_is_far_too_large(
+    times: float, level: SummaryLevel
+) -> None:
+    """Beside what is smaller it hardly has one on a slow link, and a newer one takes its place."""
+    hand = ByHand()
+    for _ in range(MISSES):
+        assert hand.fit.choose(0.0, RATE_BPS) is RAW
+        hand.whole(DropReason.SUPERSEDED, int(times * FAR_TOO_LARGE * RATE_BPS / 8))
+    assert hand.fit.choose(0.1, RATE_BPS) is level
 
 
 def test_probes_in_vain_come_less_and_less_often() -> None:
@@ -192,5 +204,5 @@ def test_messages_whose_fate_never_comes_are_let_go() -> None:
     hand = ByHand()
     for seq in range(10 * MAX_WATCHED):
         hand.channel.flying[seq] = OutMessage(Message(hand.channel.stream.id, seq, b"", 0, 0.0))
-        hand.fit.sent(seq)
+        hand.fit.sent(seq, 1000)
     assert hand.fit.choose(1.0, RATE_BPS) is RAW and hand.fit.watched == MAX_WATCHED
