@@ -1,11 +1,15 @@
 """The window backs off from a queue that is too long: once a round trip, and at once where it is far too long."""
 
 from math import inf
+from typing import Final
 
 from sern_core.path.capacity import AckSample
 from sern_core.path.congestion.growth import Growth
 from sern_core.path.congestion.params import HybridParams
 from sern_core.path.congestion.path_model import PathModel
+
+SMALL_JITTER: Final = 0.15
+"""Share of a round trip."""
 
 
 class Backoff:
@@ -35,6 +39,14 @@ class Backoff:
             return False
         return receiver_s >= self.far_since_s + self._params.emergency_s and now >= self.hold_until_s
 
+    @property
+    def _held_s(self) -> float:
+        """What jitter adds to the least round trip: a window without it would be too small, and its rate again."""
+        path = self._path
+        if not path.view.jittery or path.view.calm:
+            return 0.0
+        return max(0.0, path.view.jitter_s - SMALL_JITTER * (path.rtt_s or 0.0))
+
     def cut_at_once(self, now: float, window: float, least_window: float, queue_s: float) -> float | None:
         """The queue is far too long: the link got slower. Returns the window; None: too little is known of the path."""
         path = self._path
@@ -46,7 +58,7 @@ class Backoff:
         self.hold_until_s = now + max(0.1, rtt_s + queue_s)
         self.far_since_s = None
         self._growth.empty_epochs = 0
-        return min(window, max(self._params.emergency_cut * rate * rtt_s, least_window))
+        return min(window, max(self._params.emergency_cut * rate * (rtt_s + self._held_s), least_window))
 
     def cut(self, now: float, window: float, rate: float, rtt_s: float, *, epochs: int) -> float:
         """The window after an epoch whose queue was too long, as it was for so many `epochs`. `rate`: what is known."""
@@ -58,7 +70,7 @@ class Backoff:
         if epochs >= 2 and path.slowdown.faster_rate is None:
             self._replace_rate(now, recent)
         self.hold_until_s = now + rtt_s
-        return min(window, self._params.cut * min(recent, rate) * rtt_s + path.fragment)
+        return min(window, self._params.cut * min(recent, rate) * (rtt_s + self._held_s) + path.fragment)
 
     def look_for_slower_link(self, sample: AckSample) -> float | None:
         """A packet has met a queue that is too long. Returns the rate of the link, in bytes/s, if it got slower, or

@@ -8,7 +8,8 @@ Theory of operation
     *Rate.* Bytes received between two stamps of the receiver, over a round trip and at least 120 ms; the capacity B is
     the greatest of the recent ones while there was more to send. While q stays above `hi` the link is never idle, so
     that what arrives in 120 ms is all it can do now: a link that got slower is known by then, a faster one by growth.
-    Where a burst now and again leaves the link idle in between, B is what came while one arrived.
+    Where a burst now and again leaves the link idle in between, B is what came while one arrived, and the pace is a
+    quarter above it: bursts would show our own pace else. What little was offered without a burst is no B.
     *Window.* The queue is W − B·RTT, so an error of q is corrected as what it is in bytes: W += γ·B·(q* − q). While
     the path looks empty the step doubles every epoch, up to a quarter of W. A queue above `hi` cuts W to what the
     receiver saw; one far above for longer than a moment does it at once (the link got slower).
@@ -19,7 +20,9 @@ Theory of operation
     queue short. Where packets take long it also tries the empty path, in small steps, with a window that leaves room.
     What is lost on the way is added. B does not follow what our own pacing made of it.
     *Start-up.* The first packets leave in a train: its dispersion shows the capacity one round trip later, and the
-    window goes there in steps of at most `STARTUP_GAIN`.
+    window goes there in steps of at most `startup_gain`. Packets that jitter spreads come in clumps and not evenly:
+    where they do, the window doubles instead, and is full when packets take longer for two rounds. Bursts too short for
+    a train end it where they show the rate.
     *Swings.* A link whose rate goes up and down all the time (cellular) is followed acknowledgement by acknowledgement,
     with a queue that shows what it can do now (`variable`), until it keeps a rate again.
     *Draining.* When no empty queue was seen for a while, one round trip at 0.6 of the product shows it. A queue that
@@ -38,6 +41,7 @@ from sern_core.path.capacity import AckSample, CapacityEstimator, Receiver
 from sern_core.path.congestion.backoff import Backoff
 from sern_core.path.congestion.contention import Contention, Verdict
 from sern_core.path.congestion.growth import Growth
+from sern_core.path.congestion.link_rate import BURSTS
 from sern_core.path.congestion.losses import Losses
 from sern_core.path.congestion.mode import STARTUP, STEADY, TRANSITIONS, Event
 from sern_core.path.congestion.pace import Pace
@@ -87,7 +91,7 @@ class HybridWindow(CapacityEstimator):
         self._swings = Swings(params, path, contention.drain)
         self._resumed_s = -inf  # when the first acknowledgement after a silence came
         self._restart()
-        self._start.begin_round(-inf, self._window, None)
+        self._start.begin(-inf, self._window, None)
 
     def _restart(self) -> None:
         """What was under way says nothing about what will be."""
@@ -204,12 +208,14 @@ class HybridWindow(CapacityEstimator):
         else:
             self._look_for_slower_link(sample)
         # Half a window and no queue: it was not the path that held us back, but our own pacing or a busy processor.
-        limited = app_limited or (queue_s <= high_s and 2 * sample.inflight_bytes < self._window)
+        held = queue_s <= high_s and 2 * sample.inflight_bytes < self._window
         rtt_s = path.rtt_s or 0.0
-        if mode is STEADY and (app_limited or self._rate.burst is None):  # it begins or ends
+        if (mode is STEADY or mode.starting) and (app_limited or self._rate.burst is None):  # it begins or ends
             spread_s = self._view.jitter_s
             self._rate.note_burst(now, receiver_s, cum_bytes, app_limited=app_limited, spread_s=spread_s, rtt_s=rtt_s)
-        measured = self._rate.measure(receiver_s, cum_bytes, app_limited=limited, rtt_s=rtt_s)
+            if self._mode.starting and self._rate.bursts >= BURSTS and not self._start.rate:
+                self._end_startup(self._window)  # they are too short for a train
+        measured = self._rate.measure(receiver_s, cum_bytes, app_limited=app_limited, held=held, rtt_s=rtt_s)
         if measured is not None:
             self._note_rate(now, *measured)
         if path.epoch_s is None:
@@ -254,7 +260,7 @@ class HybridWindow(CapacityEstimator):
         """A silence is over. What left in it was lost, or comes in a trickle that is no train."""
         self._restart()
         self._resumed_s = now
-        self._start.begin_round(now, self._window, self._pace.value, resumed=True)
+        self._start.begin(now, self._window, self._pace.value, resumed=True, may_jitter=self._view.may_jitter)
 
     # --- the rate -------------------------------------------------------------------------------------------------
 
@@ -298,18 +304,21 @@ class HybridWindow(CapacityEstimator):
         self._happens(Event.RESTART)
         self._rival.cubic = None
         self._pace.set(self._mode, self._window)
-        self._start.begin_round(now, self._window, self._pace.value)
+        self._start.begin(now, self._window, self._pace.value, may_jitter=self._view.may_jitter)
 
     def _ramp(self, sample: AckSample) -> None:
         """One acknowledgement of start-up."""
         path, start, now = self._path, self._start, sample.now
         if path.rtt_s is None or (sample.rtt_s < path.rtt_s and not sample.overtook):
             path.rtt_s = sample.rtt_s
-        sent_s = now - sample.rtt_s if sample.sent_s is None else sample.sent_s
-        if sample.app_limited or sent_s < start.since_s:
+        left_s = now - sample.rtt_s if sample.sent_s is None else sample.sent_s
+        if sample.app_limited:
+            start.nothing_more(left_s)
+            return
+        if left_s < start.since_s:
             return
         rtt_s = path.rtt_s or self._params.min_epoch_s
-        ramp = start.ramp(sample, window=self._window, rtt_s=rtt_s, fragment=path.fragment)
+        ramp = start.ramp(sample, left_s, window=self._window, rtt_s=rtt_s, fragment=path.fragment)
         if ramp is None:
             return
         if ramp.round_over:
@@ -317,6 +326,9 @@ class HybridWindow(CapacityEstimator):
             self._rate.peak = max(self._rate.peak, min(start.rate, self._window / rtt_s))
             self._pace.set(self._mode, self._window)
         if ramp.filled:
+            if start.jittery:
+                self._growth.room.hurry()  # the window may well be short of what there is
+                self._view.learn()
             self._end_startup(ramp.window)
         else:
             start.begin_round(now, self._window, self._pace.value)
@@ -334,7 +346,7 @@ class HybridWindow(CapacityEstimator):
         drain, rival, losses = self._drain, self._rival, self._losses
         interval_s = drain.interval_s(self._path.rtt_s or 0.0)
         memory_s = self._contention.memory_s(interval_s, varying=self._mode.varying)
-        seen = self._path.close_epoch(now, memory_s, self._window)
+        seen = self._path.close_epoch(now, memory_s, self._window, steered=not self._mode.starting)
         if seen.early and now < rival.adopted_until_s:
             rival.remember(now)  # the short way is back: it was a queue
         if seen.quicker:
@@ -356,8 +368,12 @@ class HybridWindow(CapacityEstimator):
         elif self._mode.starting:
             # What left before a silence was over is known to be lost within two round trips.
             told = (self._path.epoch_s or now) >= self._resumed_s + 2 * seen.rtt_s
-            if seen.limited and (seen.queue_s > self._view.high_s / 2 or (told and lost > 0.2)):
-                rate = self._rate.arrived.rate()
+            # Packets that jitter holds up have not queued.
+            long_s = self._view.high_s * (3.0 if self._start.jittery else 0.5)
+            queued = seen.queue_s > long_s and self._start.rate > 0.0
+            if seen.limited and (queued or (told and self._start.loses(losses.unusual(lost, self._path.fragment)))):
+                # What came lately may have been little, since there was little to send.
+                rate = max(self._rate.arrived.rate() or 0.0, self._start.rate)
                 self._end_startup(min(self._window, rate * seen.rtt_s) if rate else self._window / 2)
         elif self._mode.varying:
             if not self._swings.close_epoch(now, seen):
@@ -393,7 +409,7 @@ class HybridWindow(CapacityEstimator):
     def _follow_queue(self, now: float, seen: Seen, lost: float) -> None:
         params, path, rival = self._params, self._path, self._rival
         rate = self._rate.value
-        if rate is None:
+        if rate is None or not self._rate.shown:
             return
         window = self._window
         if seen.queue_s > self._view.high_s:

@@ -22,11 +22,15 @@ class LinkRate:
         "_mark",
         "_params",
         "_rates",
+        "_span_idle",
         "_span_limited",
         "arrived",
         "burst",
+        "bursts",
+        "by_bursts",
         "peak",
         "saturated",
+        "shown",
         "value",
     )
 
@@ -35,13 +39,19 @@ class LinkRate:
         self._rates = GreatestRate()
         self.value: float | None = None
         self.saturated = False
+        self.shown = False
+        """Whether `value` says what the link can do, and not what little was offered."""
+        self.bursts = 0
+        """How many were measured, while nothing else showed it."""
+        self.by_bursts = False
+        """Whether bursts with pauses between them are all that shows it."""
         self.peak = 0.0
         self.measure_anew()
 
     def measure_anew(self) -> None:
         """What arrived so far says nothing about what will."""
         self.skip_span()
-        self._span_limited = False
+        self._span_limited = self._span_idle = False
         self.arrived = LatelyArrived()
         self.burst: tuple[float, int] | None = None
         """When it began by the receiver's clock, and bytes by then; None: there is none."""
@@ -55,20 +65,24 @@ class LinkRate:
         """Nothing is known of the link; what begins anew shows little at first."""
         self._rates.clear()
         self.value = None
-        self.saturated = False
+        self.saturated = self.shown = self.by_bursts = False
+        self.bursts = 0
         self.measure_anew()
 
     def measure(
-        self, receiver_s: float, cum_bytes: int, *, app_limited: bool, rtt_s: float
+        self, receiver_s: float, cum_bytes: int, *, app_limited: bool, held: bool, rtt_s: float
     ) -> tuple[float, bool] | None:
-        """The rate over a span that ends now, and whether there was not always more to send; None: it goes on."""
+        """The rate over a span that ends now, and whether that is less than the link takes; None: it goes on.
+        `app_limited`: there was nothing more to send; `held`: something of ours held back what there was."""
         mark = self._mark
         if mark is None:
             self._mark = (receiver_s, cum_bytes)
-            self._span_limited = app_limited
+            self._span_limited = app_limited or held
+            self._span_idle = app_limited
             return None
-        if app_limited:
+        if app_limited or held:
             self._span_limited = True
+        self._span_idle |= app_limited
         span_s = receiver_s - mark[0]
         if span_s < self._params.min_rate_span_s or span_s < rtt_s:
             return None
@@ -76,8 +90,11 @@ class LinkRate:
         if rate <= 0.0:
             return None  # the receiver names newer packets and no more bytes: that says nothing of the path
         limited = self._span_limited
+        if not self._span_idle:
+            self.shown, self.by_bursts = True, False
         self._mark = (receiver_s, cum_bytes)
-        self._span_limited = app_limited  # nothing more was there when this packet left: the next span begins idle
+        self._span_limited = app_limited or held  # nothing more was there when this packet left: the next begins idle
+        self._span_idle = app_limited
         return rate, limited
 
     def note_burst(
@@ -96,7 +113,9 @@ class LinkRate:
             return
         rate = (cum_bytes - began[1]) / (receiver_s - began[0] + spread_s)
         if not self.saturated or self.value is None:
-            self.note(now, rate, rtt_s)
+            self.by_bursts = True
+            self.bursts += 1
+            self.show(now, rate, rtt_s)
         elif rate > BURST_TIMES * self.value:
             self._faster.append(rate)
             if len(self._faster) == BURSTS:
@@ -116,12 +135,18 @@ class LinkRate:
     def saturate(self) -> None:
         """There is more to send than the link takes: what bursts showed is forgotten."""
         if not self.saturated:
-            self.saturated = True
+            self.saturated = self.shown = True
+            self.by_bursts = False
             self._rates.clear()
 
     def note(self, now: float, rate: float, rtt_s: float) -> None:
         """The link has carried `rate`."""
         self.value = self._rates.note(now, rate, max(self._params.rate_window_s, 3 * rtt_s))
+
+    def show(self, now: float, rate: float, rtt_s: float) -> None:
+        """The link can do `rate` at least, though there was not more to send for long."""
+        self.shown = True
+        self.note(now, rate, rtt_s)
 
     def replace(self, now: float, rate: float, rtt_s: float) -> None:
         """The link carries `rate`, whatever was seen before."""

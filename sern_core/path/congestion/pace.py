@@ -44,8 +44,8 @@ class Pace:
         params, rate, view, loss = self._params, self._path.rate, self._path.view, self._losses.usual
         pace = self.value = params.pacing_gain * window / rtt_s
         carried = rate.value
-        if carried is None or not rate.peak:
-            return  # nothing has been delivered in an epoch yet
+        if carried is None or not rate.peak or not rate.shown:
+            return  # nothing has been delivered in an epoch yet, or too little to go by
         if self._growth.room.trying:
             return  # the window alone is to say how much is under way
         if view.empty:
@@ -61,5 +61,7 @@ class Pace:
                     gain = params.calm_pacing + params.calm_share * max(0.0, 1 - carried / rate.peak)
             if view.calm:
                 carried /= 1 - loss  # what arrives is less than what was sent
+            if rate.by_bursts:
+                gain = max(gain, params.burst_pacing)
             self.capped = view.calm and gain * carried < pace
             self.value = max(min(pace, gain * carried), 1.0)

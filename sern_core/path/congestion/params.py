@@ -10,6 +10,8 @@ class HybridParams:
     # Epochs and what is measured in them
     min_epoch_s: float = 0.040
     min_epoch_samples: int = 4
+    jittery_epoch_samples: int = 16
+    """Fewer say little of the queue where jitter moves each of them."""
     base_window_s: float = 10.0
     rate_window_s: float = 1.2
     min_rate_span_s: float = 0.120
@@ -59,14 +61,26 @@ class HybridParams:
 
     # Start-up
     startup_gain: float = 4.0
+    startup_jittery_gain: float = 2.0
+    """Where packets come unevenly."""
     startup_pacing: float = 4.0
     startup_aim: float = 0.9
+    startup_share: float = 0.75
+    """Of the window, which a round ends with."""
+    startup_longer: float = 0.25
+    """A round is of a full window if packets took so many times as long as in the quickest one..."""
+    startup_far: float = 2.0
+    """... far more than full if they took so many times as long..."""
+    startup_rounds: int = 2
+    """... and so many in a row show that it is, where packets come unevenly."""
 
     # Pacing
     pacing_gain: float = 1.03
     calm_pacing: float = 0.985
     calm_share: float = 0.05
     """How much faster the pace is of a sender that has none of the link, so that shares meet."""
+    burst_pacing: float = 1.25
+    """Where only bursts show what the link carries: at a slower pace they would show the pace."""
     drain_pacing: float = 0.98
     compete_pacing: float = 1.2
     gentle_pacing: tuple[float, ...] = (1.01, 1.01, 1.01, 1.02, 1.03, 1.05, 1.09, 1.17, 1.3, 1.5)

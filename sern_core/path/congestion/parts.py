@@ -2,7 +2,6 @@
 CUBIC's window for company that keeps a queue."""
 
 from collections import deque
-from itertools import pairwise
 from math import inf
 from typing import Final
 
@@ -13,10 +12,6 @@ BURST_RATE_SPAN_S: Final = 0.150
 MARK_SPACING_S: Final = 0.020
 MAX_MARKS: Final = 16
 SWING_AFTER_S: Final = 2.0
-TRAIN_BYTES: Final = 8 * 1200
-TRAIN_SPREAD: Final = 1.1
-"""A train was spread by the path if it takes so many times as long to arrive as it took to leave."""
-STALL_S: Final = 0.1
 AGREE_S: Final = 2.0
 EASED_S: Final = 0.001
 EASED_SHARE: Final = 0.35
@@ -114,38 +109,6 @@ class LatelyArrived:
         last_s, last_bytes = marks[-1]
         since = next((mark for mark in reversed(marks) if last_s - mark[0] >= BURST_RATE_SPAN_S), marks[0])
         return (last_bytes - since[1]) / (last_s - since[0]) or None
-
-
-class Train:
-    """What arrives in a round of start-up. The dispersion of `TRAIN_BYTES` shows the bottleneck's rate."""
-
-    __slots__ = ("_packets", "nbytes", "rate", "spread")
-
-    def __init__(self) -> None:
-        self.rate = 0.0  # bytes/s, the greatest of the round
-        self.nbytes = 0
-        self.spread = True
-        """Whether the latest packets arrived farther apart than they left: by the bottleneck, not by our sending."""
-        self._packets: deque[tuple[float, int, float | None]] = deque()  # (receiver's stamp, bytes by then, when sent)
-
-    def note(self, receiver_s: float, cum_bytes: int, acked_bytes: int, sent_s: float | None) -> bool:
-        """Whether it was enough to tell a rate by."""
-        packets = self._packets
-        packets.append((receiver_s, cum_bytes, sent_s))
-        self.nbytes += acked_bytes
-        while len(packets) > 2 and cum_bytes - packets[1][1] >= TRAIN_BYTES:
-            packets.popleft()
-        at_s, first_bytes, first_sent_s = packets[0]
-        if cum_bytes - first_bytes < TRAIN_BYTES:
-            return False
-        span_s = receiver_s - at_s
-        if span_s > STALL_S and any(later - earlier > 0.6 * span_s for (earlier, *_), (later, *_) in pairwise(packets)):
-            packets.clear()  # a stream stood still for a lost segment: that says nothing about its rate
-            return False
-        rate = (cum_bytes - first_bytes) / span_s if span_s > 1e-5 else inf
-        self.rate = max(self.rate, rate)
-        self.spread = first_sent_s is None or sent_s is None or span_s > TRAIN_SPREAD * (sent_s - first_sent_s)
-        return True
 
 
 class Eased:

@@ -122,16 +122,17 @@ class PathModel:
 
     def epoch_over(self, now: float) -> bool:
         """Whether the epoch has lasted for a round trip, and shows something."""
-        params = self._params
+        params, view = self._params, self.view
+        samples = params.jittery_epoch_samples if view.jittery and not view.calm else params.min_epoch_samples
         return (
             self.epoch_s is not None
             and now >= self.epoch_s + max(params.min_epoch_s, self.rtt_s or 0.0)
-            and len(self._samples) >= params.min_epoch_samples
+            and len(self._samples) >= samples
         )
 
-    def close_epoch(self, now: float, memory_s: float, window: float) -> Seen:
+    def close_epoch(self, now: float, memory_s: float, window: float, *, steered: bool) -> Seen:
         """See what the delays of the epoch say of path and queue. `memory_s`: how long the least delay of late counts;
-        `window`: bytes that may be under way."""
+        `window`: bytes that may be under way; `steered`: it was one that keeps the queue short."""
         delay, view, fragment = self.delay, self.view, self.fragment
         queues = sorted([queue_s for queue_s, _ in self._samples])
         backs = sorted([back_s for _, back_s in self._samples])
@@ -143,9 +144,11 @@ class PathModel:
         delay.came_early(early_s)
         rtt_s = self.rtt_s = max(1e-5, delay.empty_s + backs[count // 2])
         self.rate.decay(now - (self.epoch_s or now))
-        view.close_epoch(queues, rtt_s, self.rate, fragment, usual=fragment <= self._first_fragment_bytes)
+        usual = fragment <= self._first_fragment_bytes
+        limited = 2 * self._limited >= count
+        view.close_epoch(queues, rtt_s, self.rate, fragment, usual=usual, limited=limited, steered=steered)
         self._look_for_end_of_queue(now, window)
-        return Seen(view.queue_s, rtt_s, 2 * self._limited >= count, early, quicker)
+        return Seen(view.queue_s, rtt_s, limited, early, quicker)
 
     def begin_epoch(self, now: float) -> None:
         """What was seen of the last one has been dealt with."""

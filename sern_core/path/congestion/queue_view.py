@@ -2,17 +2,23 @@
 
 from collections import deque
 from math import inf
+from typing import Final
 
 from sern_core.path.congestion.link_rate import LinkRate
 from sern_core.path.congestion.params import HybridParams
+
+KNOWN_EPOCHS: Final = 8
+"""From then on it is known whether a path has jitter."""
 
 
 class QueueView:
     """The queue of the last epoch, and the one that is wanted there."""
 
     __slots__ = (
+        "_learned_epochs",
         "_params",
         "_spreads",
+        "_steered_epochs",
         "calm",
         "gentle",
         "high_s",
@@ -28,6 +34,8 @@ class QueueView:
     def __init__(self, params: HybridParams) -> None:
         self._params = params
         self._spreads: deque[float] = deque(maxlen=16)
+        self._steered_epochs = 0
+        self._learned_epochs = KNOWN_EPOCHS  # since it was known that there is jitter
         self.queue_s = 0.0
         """20th percentile of the epoch."""
         self.most_s = 0.0
@@ -47,14 +55,31 @@ class QueueView:
         self.jittery = False
         """Whether the spread is more than packets in each other's way make of it."""
 
-    def close_epoch(self, queues: list[float], rtt_s: float, rate: LinkRate, fragment: float, *, usual: bool) -> None:
-        """See the queues of an epoch, sorted. `usual`: the largest packet is of the size that was planned for."""
+    def close_epoch(
+        self,
+        queues: list[float],
+        rtt_s: float,
+        rate: LinkRate,
+        fragment: float,
+        *,
+        usual: bool,
+        limited: bool,
+        steered: bool,
+    ) -> None:
+        """See the queues of an epoch, sorted. `usual`: the largest packet is of the size that was planned for.
+        `limited`: there was more to send; `steered`: the queue was kept short. With neither, what spreads the queue may
+        be what was sent at once now and again."""
         params = self._params
         count = len(queues)
         fifth_s, self.most_s = queues[count // 5], queues[count * 4 // 5]
         spread_s = self.most_s - fifth_s
         self.queue_s = max(0.0, fifth_s)
-        self.jitter_s += 0.1 * (min(spread_s, 0.020 + 0.2 * rtt_s) - self.jitter_s)
+        if steered or limited:
+            weight = 1.0 / (2 + min(self._learned_epochs, KNOWN_EPOCHS))
+            self.jitter_s += weight * (min(spread_s, 0.020 + 0.2 * rtt_s) - self.jitter_s)
+        if steered:
+            self._steered_epochs += 1
+            self._learned_epochs += 1
         # Of the link, not of our share of it: by the greatest rate seen lately.
         serialise_s = self.serialise_s = fragment / rate.peak if rate.peak else 0.0
         self._spreads.append(spread_s)
@@ -73,6 +98,15 @@ class QueueView:
         turns_s = params.turns_s * max(0.0, 1 - params.turns_rate / rate.peak) if rate.peak else 0.0
         self.target_s = params.target_s + packets * min(own_s, 4 * serialise_s) + noise_s + turns_s
         self.high_s = max(0.010, 0.1 * rtt_s) + serialise_s + 1.5 * noise_s
+
+    def learn(self) -> None:
+        """There is jitter, of which too little is known."""
+        self._learned_epochs = 0
+
+    @property
+    def may_jitter(self) -> bool:
+        """Whether packets may come unevenly on an empty path: they do, or too little was seen of it."""
+        return self.jittery or self._steered_epochs < KNOWN_EPOCHS
 
     @property
     def long(self) -> bool:

@@ -244,7 +244,7 @@ def loaded() -> tuple[TraceRecord, ...]:
     world = World()
     robot, _site = pair(world, THIN)
     busy(world, robot)
-    world.run(5.0)
+    world.run(10.0)
     return robot.core.trace.records()
 
 

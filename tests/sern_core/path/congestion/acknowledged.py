@@ -47,12 +47,13 @@ class Path:
             sample = self.packet(queue_s, app_limited=app_limited)
             model.note(sample)
             carried = model.rate.measure(
-                sample.receiver_s, sample.cum_bytes, app_limited=app_limited, rtt_s=model.rtt_s or 0.0
+                sample.receiver_s, sample.cum_bytes, app_limited=app_limited, held=False, rtt_s=model.rtt_s or 0.0
             )
             if carried is not None:
                 model.rate.note(self.now, carried[0], model.rtt_s or 0.0)
-                model.rate.saturated |= not carried[1]
-        seen = model.close_epoch(self.now, MEMORY_S, self.window)
+                if not carried[1]:
+                    model.rate.saturate()
+        seen = model.close_epoch(self.now, MEMORY_S, self.window, steered=True)
         model.begin_epoch(self.now)
         return seen
 

@@ -2,6 +2,7 @@
 built for it where there is little jitter."""
 
 from dataclasses import replace
+from statistics import median
 
 import pytest
 
@@ -67,9 +68,9 @@ def test_rates_of_all_kinds_are_found_again(rate_bps: float, thin_bps: float) ->
     [(4e6, 0.001), (8e6, 0.0005), (8e6, 0.001), *also((4e6, 0.0), (4e6, 0.0005), (8e6, 0.0))],
 )
 def test_little_jitter_is_no_reason_for_a_queue(rate_bps: float, jitter_s: float) -> None:
-    poses = run(link(rate_bps, jitter_s), 14.0, 1).poses_ms(5.0)
-    assert at(poses, 0.5) < 1e3 * DELAY_S + 5.0
-    assert at(poses, 0.99) < 1e3 * DELAY_S + 10.0
+    runs = [run(link(rate_bps, jitter_s), 14.0, seed).poses_ms(5.0) for seed in (1, 2, 3)]
+    assert median(at(poses, 0.5) for poses in runs) < 1e3 * DELAY_S + 5.0
+    assert median(at(poses, 0.99) for poses in runs) < 1e3 * DELAY_S + 10.0
 
 
 @pytest.mark.parametrize("jitter_s", [0.005, 0.010])

@@ -70,3 +70,24 @@ def test_start_up_may_end_with_a_rate_and_before_any_epoch_has_seen_one() -> Non
     pace = pacing(path)
     pace.set(STEADY, 10_000.0)
     assert pace.value is not None and 8 * pace.value > 8e6 and not pace.capped
+
+
+def test_what_little_was_offered_is_no_rate_to_go_by() -> None:
+    path = Path()
+    path.epoch(0.1, app_limited=True)
+    path.epoch(0.1, app_limited=True)
+    assert path.model.rate.value is not None and not path.model.rate.shown
+    pace = pacing(path)
+    pace.set(STEADY, WINDOW)
+    assert not pace.capped and pace.value == pytest.approx(PARAMS.pacing_gain * WINDOW / (path.model.rtt_s or 0.0))
+
+
+def test_a_pace_above_what_bursts_showed_lets_them_show_more() -> None:
+    path = Path()
+    path.epoch(0.0, app_limited=True)
+    path.model.rate.by_bursts = True
+    path.model.rate.show(path.now, 900e3, RTT_S)
+    path.epoch(0.1, app_limited=True)
+    pace = pacing(path)
+    pace.set(STEADY, WINDOW)
+    assert pace.value == pytest.approx(PARAMS.burst_pacing * 900e3)
