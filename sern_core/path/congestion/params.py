@@ -11,7 +11,9 @@ class HybridParams:
     min_epoch_s: float = 0.040
     min_epoch_samples: int = 4
     jittery_epoch_samples: int = 16
-    """Fewer say little of the queue where jitter moves each of them."""
+    """Fewer say little of the queue where jitter moves each of them..."""
+    jittery_epochs: float = 4.0
+    """... but an epoch lasts at most so many times as long for it."""
     base_window_s: float = 10.0
     rate_window_s: float = 1.2
     min_rate_span_s: float = 0.120

@@ -122,13 +122,13 @@ class PathModel:
 
     def epoch_over(self, now: float) -> bool:
         """Whether the epoch has lasted for a round trip, and shows something."""
-        params, view = self._params, self.view
-        samples = params.jittery_epoch_samples if view.jittery and not view.calm else params.min_epoch_samples
-        return (
-            self.epoch_s is not None
-            and now >= self.epoch_s + max(params.min_epoch_s, self.rtt_s or 0.0)
-            and len(self._samples) >= samples
-        )
+        params, view, count = self._params, self.view, len(self._samples)
+        if self.epoch_s is None or count < params.min_epoch_samples:
+            return False
+        lasted_s, least_s = now - self.epoch_s, max(params.min_epoch_s, self.rtt_s or 0.0)
+        if view.jittery and not view.calm and count < params.jittery_epoch_samples:
+            least_s *= params.jittery_epochs
+        return lasted_s >= least_s
 
     def close_epoch(self, now: float, memory_s: float, window: float, *, steered: bool) -> Seen:
         """See what the delays of the epoch say of path and queue. `memory_s`: how long the least delay of late counts;
