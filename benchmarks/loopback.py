@@ -197,7 +197,7 @@ class Carried(NamedTuple):
 
     @property
     def cpu_us(self) -> float:
-        """For each message."""
+        """CPU for each message."""
         return self.cpu_s / self.messages * 1e6
 
 

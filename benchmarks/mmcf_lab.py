@@ -224,7 +224,7 @@ def _ask(node: Node, path: str) -> Any:
 
 
 async def _connected(robot: Node, topics: int) -> bool:
-    """Over the datagram lane, and all of the topics have reached somebody."""
+    """Whether the robot is connected over the datagram lane, and all of the topics have reached somebody."""
     try:
         link = _ask(robot, "/api/link")
         sent = [entry for entry in _ask(robot, "/api/topics").values() if entry["direction"] == "send"]

@@ -95,7 +95,7 @@ async def _first(arrivals: Sequence[Arrival], topic: str) -> float:
 
 
 async def _chain(ros: ros1.Ros, master: str, other: str) -> list[Child]:
-    """From one master to another; whatever is a cloud comes along."""
+    """Start relay and clients from one master to another; whatever is a cloud comes along."""
     endpoints = {
         name: {"kind": "ros1", "master_uri": uri, "host": HOST} for name, uri in ((ROBOT, master), (SITE, other))
     }

@@ -49,7 +49,7 @@ ROBOTS: Final = (RobotOptions("jackal1", "/jackal1/odom", "/jackal1/plan"), Robo
 
 
 def bend(time_s: float) -> Motion:
-    """At 1 m/s to the left."""
+    """The motion of a robot that turns to the left at 1 m/s."""
     turned = time_s / RADIUS_M
     return Motion(
         RADIUS_M * math.sin(turned), RADIUS_M * (1 - math.cos(turned)), math.remainder(turned, 2 * math.pi),

@@ -93,7 +93,7 @@ class Bridge:
         self.inbound.rules_changed()
 
     def close(self) -> None:
-        """Before the endpoint is stopped: a robot that is being commanded is told to stand still."""
+        """Call this before the endpoint is stopped: it tells a robot that is being commanded to stand still."""
         self.outbound.close()
         if self.goals is not None:
             self.goals.close()

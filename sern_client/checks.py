@@ -26,7 +26,7 @@ class Comparable(Protocol):
 
 @dataclass(slots=True)
 class _Repair:
-    """Since when a difference is known, when it is repaired next, and how long it has until it is again."""
+    """The repairs of a difference: since when it is known, when the next one is, and the pause after that."""
 
     since_s: float
     due_s: float

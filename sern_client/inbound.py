@@ -137,7 +137,7 @@ class Inbound:
         return self._streams.keys()
 
     def close(self) -> None:
-        """Before the endpoint is stopped: a robot that is being commanded is told to stand still."""
+        """Call this before the endpoint is stopped: it tells a robot that is being commanded to stand still."""
         self._closed = True
         self._keep_timer.cancel()
         self._again.cancel()

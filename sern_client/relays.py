@@ -344,7 +344,7 @@ class Relays:
         return {} if keyring is None else keyring.to_json()
 
     def to_json(self) -> dict[str, object]:
-        """At which one the client is, and how it is with the others."""
+        """The relay at which the client is, and how it is with the others."""
         now, at = clock.now(), self.current
         return {
             "address": at.address,

@@ -344,7 +344,7 @@ class ServiceBridge:
             self._cancelling.begin(self._cancel(TopicName(f"{action}/_action/cancel_goal"), body))
 
     async def _cancel(self, service: TopicName, request: bytes) -> None:
-        """Until it has been answered: the link may be away."""
+        """Ask until it has been answered: the link may be away."""
         until_s = clock.now() + CANCEL_S
         while clock.now() < until_s:
             used = self.used.get(service)

@@ -234,7 +234,7 @@ class RelayServer:
 
     @staticmethod
     def _claimed(data: bytes) -> str:
-        """Without keys the first datagram must be a HELLO or a JOIN, and its name is believed."""
+        """The name that a peer without keys has in its first datagram, a HELLO or a JOIN; it is believed."""
         header = framing.decode_header(data)
         if header.kind not in (framing.Kind.HELLO, framing.Kind.JOIN):
             raise WireError("the first datagram of a connection must be HELLO or JOIN")

@@ -73,7 +73,7 @@ class Adaptation:
             self.reset()
 
     async def run(self) -> None:
-        """Until cancelled. An interval that comes late is a longer one; none is made up for."""
+        """Adapt until cancelled. An interval that comes late is a longer one; none is made up for."""
         count = 0
         while True:
             await asyncio.sleep(self._params.interval_s / SAMPLES)

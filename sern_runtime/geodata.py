@@ -235,7 +235,7 @@ def _system(said: str | None, file: str) -> Any:
 
 
 def _to_degrees(system: Any, file: str) -> Any:
-    """From places in a reference system to longitude and latitude."""
+    """A transformer from places in a reference system to longitude and latitude."""
     import pyproj
     import pyproj.exceptions
 

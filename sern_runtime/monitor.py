@@ -425,11 +425,11 @@ class ConnectionTable:
         self._monitor = SocketMonitor(socket, self._on_event)
 
     def close(self) -> None:
-        """Before the socket. Idempotent."""
+        """Close this before the socket. Idempotent."""
         self._monitor.close()
 
     def await_unbound(self, until_s: float) -> bool:
-        """After `unbind` wait until libzmq has let go of the address, or until `until_s` on `sern_runtime.clock`.
+        """Wait after `unbind` until libzmq has let go of the address, or until `until_s` on `sern_runtime.clock`.
 
         False: not by then. It does so on its own thread, within some milliseconds; the loop is held up meanwhile.
         """

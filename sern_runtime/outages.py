@@ -49,7 +49,7 @@ class Outages:
             self._events.say(self._log, self._level, SILENT, peer, "%s", gone)
 
     def since_s(self, peer: str) -> float | None:
-        """Since when it has been silent; None: it is not."""
+        """The time since which a peer has been silent; None: it is not."""
         outage = self._outages.get(peer)
         return None if outage is None else outage.since_s
 

@@ -98,7 +98,7 @@ class TransportWatch:
         return received is None or received > 0
 
     def close(self) -> None:
-        """Before the socket. Idempotent."""
+        """Close this before the socket. Idempotent."""
         self._monitor.close()
         self._retries()
         self._received()

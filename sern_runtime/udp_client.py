@@ -245,7 +245,7 @@ class UdpClient(Sealed):
             self.on_path(self.address, True)
 
     def _challenge(self) -> None:
-        """Until the relay answers. Of the full size: the path must carry it, and the relay may answer as much."""
+        """Ask until the relay answers. The full size: the path must carry it, and the relay may answer as much."""
         if self._probe is not None:
             self._probe.cancel()
         self._probe = self._loop.call_later(self._probe_delay_s, self._challenge_again)

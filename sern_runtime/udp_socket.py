@@ -215,7 +215,7 @@ class DatagramSocket:
                     self._loop.add_reader(self._fd, self._readable)
 
     def _look_later(self, taken: int) -> None:
-        """After a full batch there is more: then only the others' turn is between."""
+        """Look again after a pause. A full batch says that there is more: then only the others' turn is between."""
         if taken == BATCH:
             self._paused = self._loop.call_soon(self._look)
         else:

@@ -136,7 +136,7 @@ def serve_curve(socket: "zmq.Socket[bytes]", keys: CurvePair | None, zap_domain:
 
 
 def check_plain(endpoints: Sequence[str], keys: CurvePair | None) -> None:
-    """Without keys only endpoints that stay on this machine are allowed. Raises ConfigError."""
+    """Allow endpoints that stay on this machine only, where there are no keys. Raises ConfigError."""
     if keys is None:
         for endpoint in endpoints:
             if not is_local(endpoint):

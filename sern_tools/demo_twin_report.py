@@ -53,7 +53,7 @@ class Sample(NamedTuple):
 
     @property
     def off_thought_m(self) -> float:
-        """From where the robot thinks it is: all that it can say. What its localisation is off comes on top."""
+        """Its distance from where the robot thinks it is, which is all that it can say: localisation is off on top."""
         return math.dist(self.thought[:2], self.shown[:2])
 
     @property
@@ -134,7 +134,7 @@ def _gap(samples: Sequence[Sample], start_s: float, end_s: float) -> list[Verdic
 
 
 def _within(samples: Sequence[Sample]) -> list[Verdict]:
-    """In a gap the bound is a promise; while poses come, of 95 in 100 of them (`HEARD_SHARE`)."""
+    """Judge the bound: a promise in a gap, and while poses come one for 95 in 100 of them (`HEARD_SHARE`)."""
     gap = [each for each in samples if each.age_s >= GAP_S]
     heard = [each for each in samples if each.age_s < GAP_S]
     in_gap, in_gap_said = _over(gap)

@@ -519,7 +519,7 @@ def run_echo(
     timeout_s: float = DEFAULT_TIMEOUT_S,
     out: TextIO | None = None,
 ) -> None:
-    """Until Ctrl-C, or `count` messages (with `rate`: lines). Raises SernError. Main thread only."""
+    """Print messages until Ctrl-C, or `count` of them (with `rate`: lines). Raises SernError. Main thread only."""
     out = out or sys.stdout
     problem = name_problem(topic)
     if problem is not None:

@@ -97,7 +97,7 @@ class Decoder:
         self._known: set[tuple[str, Encoding]] = set()
 
     def prepare(self, topic: str, type_name: str, definition: str, encoding: Encoding) -> None:
-        """Before the first body of a stream."""
+        """Take the type of a stream, before its first body."""
         if self._raw:
             return
         if encoding is Encoding.RAW:

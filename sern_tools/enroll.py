@@ -103,7 +103,7 @@ class Opened:
             file.unlink(missing_ok=True)
 
     async def run(self, server: EnrolmentServer, *, interactive: bool) -> None:
-        """Until it is over. Raises SernError when no client was enrolled."""
+        """Wait until it is over. Raises SernError when no client was enrolled."""
         try:
             await self._until(server, lambda: server.state is not State.OPEN)
             if server.key is not None and not server.burnt:

@@ -294,7 +294,7 @@ def rotate_client(loaded: Loaded[ClientFile], *, out: Callable[[str], None], lim
 
 
 def rotate_relay(loaded: Loaded[RelayFile], *, switch: bool, force: bool, out: Callable[[str], None]) -> None:
-    """Without `switch` make the pair to come and have clients told of it; with it go over, once they all know."""
+    """Make the pair to come and have clients told of it; with `switch` go over to it, once they all know."""
     secret = _secret_file(loaded)
     coming = secret.with_suffix(NEXT_SUFFIX)
     relay = running_relay(loaded)

@@ -48,7 +48,7 @@ class Delivery(NamedTuple):
 
     @property
     def latency_s(self) -> float:
-        """On one host, whose clock both ends share."""
+        """The time from stamp to arrival, on one host, whose clock both ends share."""
         return (self.wall_ns - self.stamp_ns) / 1e9
 
 

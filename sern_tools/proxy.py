@@ -492,7 +492,7 @@ def _listening(address: tuple[str, int]) -> socket.socket:
 
 
 def _small_buffers(sock: socket.socket) -> None:
-    """Before listen or connect, so that the announced window is small from the first packet."""
+    """Make buffers small before listen or connect, so that the announced window is small from the first packet."""
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, SOCKET_BUFFER_BYTES)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SOCKET_BUFFER_BYTES)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, SLOT_BYTES)

@@ -80,7 +80,7 @@ def whole(value: int) -> str:
 
 
 def clipped(line: Line, width: int) -> Line:
-    """At most `width` columns of a line."""
+    """The first `width` columns of a line."""
     result: Line = []
     left = width
     for text, style in line:

@@ -127,7 +127,7 @@ class Ros:
         return uri
 
     async def chain(self, master: str, other: str) -> list[Child]:
-        """From one master to another."""
+        """Start relay and clients from one master to another."""
         endpoints = {
             name: {"kind": "ros1", "master_uri": uri, "host": HOST}
             for name, uri in ((shared.ROBOT, master), (shared.SITE, other))
@@ -135,7 +135,7 @@ class Ros:
         return await shared.start_chain(self.children, endpoints, self.environment(""))
 
     async def zenoh(self, master: str, other: str) -> list[Child]:
-        """From one master to another."""
+        """Start a pair of zenoh nodes from one master to another."""
         to = [str(shared.zenoh_folder()), f"tcp/{HOST}:{free_ports(1)[0]}"]
         listener = await self.rospy("from-zenoh", other, *to)
         return [listener, await self.rospy("to-zenoh", master, *to)]

@@ -142,7 +142,7 @@ class Sink(End):
         return {"ms": found}
 
     def give(self, said):
-        """From giving a goal until it is accepted, until its feedback and its result are there; goals one by one."""
+        """Time goals, one by one: until each is accepted, until its feedback and its result are there."""
         assert self.goals.wait_for_server(WAIT_S), "no such action"
         accepted_ms, feedback_ms, result_ms = [], [], []
         for _ in range(said["count"]):

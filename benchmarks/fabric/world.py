@@ -118,7 +118,7 @@ class World:
     # --- waiting ----------------------------------------------------------------------------------------------------
 
     async def ready(self, *names: str) -> None:
-        """Until these daemons say that they are."""
+        """Wait until these daemons say that they are."""
 
         async def all_ready() -> bool:
             return await asyncio.to_thread(lambda: all(ready(self._http[name]) for name in names))
@@ -126,7 +126,7 @@ class World:
         await self.children.until(all_ready, START_S, f"{', '.join(names)}: not ready")
 
     async def connected(self, names: Sequence[str], *, every_s: float = 0.1) -> None:
-        """Until every two of these relays have a session with each other."""
+        """Wait until every two of these relays have a session with each other."""
 
         async def all_connected() -> bool:
             logs = {name: (self.folder / f"{name}.log").read_text(errors="replace") for name in names}
@@ -135,7 +135,7 @@ class World:
         await self.children.until(all_connected, START_S, "the relays did not find each other", every_s=every_s)
 
     async def flow(self, *topics: str) -> None:
-        """Until more of each topic has come to the site."""
+        """Wait until more of each topic has come to the site."""
         before = await asyncio.to_thread(delivered, self._http[SITE])
 
         async def more() -> bool:

@@ -41,8 +41,8 @@ def listen(orders: Orders, log: Log, wait: Any) -> None:
 
 
 def send_datagram(sock: socket.socket, datagram: bytes) -> None:
-    """On a connected socket. The other end may not listen yet, or no more: the kernel reports that of the datagram
-    before, and does not send this one."""
+    """Send on a connected socket. The other end may not listen yet, or no more: the kernel reports that of the
+    datagram before, and does not send this one."""
     with suppress(ConnectionRefusedError):
         sock.send(datagram)
 

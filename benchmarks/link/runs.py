@@ -196,7 +196,7 @@ async def start_program(children: Children, node: Node, name: str, program: str,
 
 
 async def until_ready(end: Child) -> None:
-    """Until it says so; rospy may say other things before."""
+    """Wait until it says so; rospy may say other things before."""
     while READY not in await end.read_line():
         pass
 

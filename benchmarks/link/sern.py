@@ -83,7 +83,7 @@ class End:
 
     @property
     def connected(self) -> bool:
-        """On the lane that is to be measured."""
+        """Whether it is connected over the lane that is to be measured."""
         link = self.core.link
         if self.spec.system == "sern-one":
             return link.established

@@ -235,7 +235,7 @@ def _odometry(bag: Path) -> Iterator[tuple[float, Motion]]:
 
 
 def _open_loop(motions: list[tuple[float, Motion]], gap_s: float, predictor: Predictor | None) -> Iterator[float]:
-    """From each measurement of a robot that moves: how far off it is so much later."""
+    """How far off a prediction is so much later, from each measurement of a robot that moves."""
     later = 0
     for start_s, start in motions:
         while later < len(motions) and motions[later][0] < start_s + gap_s - 1e-3:

@@ -182,7 +182,7 @@ def obstacle(count: int, report: Report) -> None:
 
 
 def thin(seeds: int, loss: float, report: Report) -> None:
-    """Over 256 kbit/s: a robot that sees and says where it is, and an obstacle that moves all the time."""
+    """Measure over 256 kbit/s: a robot that sees and says where it is, and an obstacle that moves all the time."""
     rows: dict[str, list[float]] = {}
     for seed in range(seeds):
         ages = {}

@@ -51,7 +51,7 @@ class Cancelling:
         await self._tasks.ended()
 
     async def _cancel(self, request: bytes, wanted: Callable[[], bool], *, once: bool) -> None:
-        """Until its server takes it: who refuses it, the link or the server, is not told."""
+        """Ask until the goal's server takes it: who refuses it, the link or the server, is not told."""
         until_s, pause_s = clock.now() + CANCEL_S, CANCEL_AGAIN_S[0]
         try:
             while clock.now() < until_s and wanted():

@@ -101,7 +101,7 @@ class Part:
         return self._passed is not None
 
     def pass_on(self, to: Passing) -> None:
-        """From now on. Where it cannot, that is said."""
+        """Pass on to `to` from now on; say so where that cannot be."""
         if self._passed is not None or self._closed:
             return
         try:

@@ -267,7 +267,7 @@ class ServerForRos1:
         return await handler(request)
 
     def _cancel(self, goal: _Goal) -> None:
-        """Until it has ended."""
+        """Ask the server to cancel the goal, until that has ended."""
         self._cancelling.begin(GoalInfo(goal.uuid, NO_STAMP), lambda: not self.goals.has_ended(goal))
 
     # --- time -------------------------------------------------------------------------------------------------------

@@ -66,7 +66,7 @@ class Publisher(Protocol):
     """Publishes on a local topic that came from the far side."""
 
     def publish(self, body: bytes, stamp_ns: int) -> None:
-        """Once nobody can be reached any more (it is closed, or the endpoint is), a message is a counted drop."""
+        """Publish a message; a counted drop once nobody can be reached any more (this or the endpoint is closed)."""
         ...
 
     def close(self) -> None: ...
@@ -228,7 +228,7 @@ class ObjectEndpoint(Protocol):
     """An endpoint with objects of its own."""
 
     def use_objects(self, objects: SiteObjects) -> None:
-        """Once, before `start`."""
+        """Take the site's objects. It is called once, before `start`."""
 
 
 @runtime_checkable
@@ -237,7 +237,7 @@ class OfferingEndpoint(Protocol):
 
     @property
     def prefix(self) -> str:
-        """Under which name its topics are."""
+        """The name under which its topics are."""
         ...
 
     def offer(self, info: TopicInfo) -> Publisher:

@@ -210,7 +210,7 @@ class CompositeEndpoint:
             self._members[index].interest(joined.name, False)
 
     def advertise(self, info: TopicInfo) -> Publisher:
-        """At every member that takes it. ConfigError, with every reason, when none does."""
+        """Advertise a topic at every member that takes it. ConfigError, with every reason, when none does."""
         publishers = _Publishers(self, info)
         with ExitStack() as failed:
             failed.callback(publishers.close)
@@ -228,7 +228,7 @@ class CompositeEndpoint:
         raise ConfigError("; ".join(dict.fromkeys(str(error) for error in refusals)))
 
     def _offer(self, publishers: _Publishers) -> list[ConfigError]:
-        """At the members that have it not yet; the refusals of those that do not take it."""
+        """Offer the topic to the members that have it not yet; returns the refusals of those that do not take it."""
         refusals: list[ConfigError] = []
         for index, member in self._publishing.items():
             if index not in publishers.parts:

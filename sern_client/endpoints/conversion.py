@@ -1,4 +1,4 @@
-"""Between ROS 1 and ROS 2 (CDR): where a stream's encoding is not the one its endpoint takes, at the egress only.
+"""Conversion between ROS 1 and ROS 2 (CDR), where a stream's encoding is not its endpoint's: at the egress only.
 
 Everywhere else bodies pass through unread. Small messages take 1 to 10 µs, a cloud of 1 MB 30 µs, and nothing that a
 body may hold takes more than about 15 ms (`sern_runtime/ros_bodies.py`), so it is done inline. What the two sides do

@@ -242,7 +242,7 @@ class JackalSource:
         return ros_geometry.pose(self._encoding, pose.x_m, pose.y_m, yaw_rad=pose.yaw_rad)
 
     def _pose_on_ground(self, pose: Pose2) -> Any:
-        """With the height and the tilt that the robot has now."""
+        """A pose message with the height and the tilt that the robot has now."""
         state = self.robot.state
         return ros_geometry.pose(
             self._encoding, pose.x_m, pose.y_m, state.z_m, pose.yaw_rad, state.roll_rad, state.pitch_rad

@@ -138,7 +138,7 @@ class RawProbe:
         self._under_way: list[tuple[Summarised, int]] = []
 
     def start(self, items: Sequence[Summarised], capacity_bps: float | None, *, now: float) -> None:
-        """After the levels have been set; `items` are those that may be chosen."""
+        """Takes over levels that have been set; `items` are those that may be chosen."""
         summarised = [item for item in items if item.level is SummaryLevel.SUMMARY]
         for gone in self._due_s.keys() - {item.source for item in summarised}:
             del self._due_s[gone]

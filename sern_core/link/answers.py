@@ -18,7 +18,7 @@ MAX_REPORTS_UNACKED: Final = 64
 
 
 class Answers:
-    """To the streams that the peer has announced."""
+    """Answers to the streams that the peer has announced."""
 
     def __init__(self, end: End, control: ControlStream, reassembly: Reassembly) -> None:
         self._end = end

@@ -187,7 +187,7 @@ class Link:
         self.outgoing.delivered(channel)
 
     def _at_once(self, channel: OutChannel) -> bool:
-        """On a stream lane data may follow its announcement at once, if the same peer wanted it before."""
+        """Whether data may follow its announcement at once: on a stream lane, if the same peer wanted it before."""
         lanes = self.lanes
         return bool(
             lanes.lane.lossless

@@ -74,7 +74,7 @@ class Claims:
     # --- streams that are relayed here ----------------------------------------------------------------------------
 
     def check(self, stream: StreamInfo) -> None:
-        """Before a stream is taken, of a client or of a peer. Raises RefusedError."""
+        """Call this before a stream of a client or of a peer is taken. Raises RefusedError."""
         topic = stream.id.topic
         if topic not in self._theirs:
             return

@@ -71,7 +71,7 @@ class Holding:
         return len(self._held)
 
     def position(self, stream: StreamId) -> int:
-        """On disk up to this seq; 0: nothing."""
+        """The seq up to which a stream is on disk; 0: nothing is."""
         held = self._held.get(stream)
         return 0 if held is None else held.stored
 

@@ -1,4 +1,4 @@
-"""At which of its relays a client is to be: when it goes to another one, and which. Pure.
+"""The choice among a client's relays: when it goes to another one, and to which. Pure.
 
 The order of the list is the order of preference. A relay that does not answer for a while is left for the next one in
 the list, and the last is followed by the first. A relay before the one that the client is at is asked now and then, and

@@ -338,8 +338,8 @@ class KeepAll:
         return spent
 
     def _leave_behind(self, now: float, room: int) -> int:
-        """Without a session the oldest that have lapsed leave nothing behind: there is nobody to tell, and the
-        announcement of the next session starts behind them. Returns what of `room` it took."""
+        """Drop the oldest that have lapsed without a session, and leave nothing behind: there is nobody to tell, and
+        the announcement of the next session starts behind them. Returns what of `room` it took."""
         spent, last_seq, runs = left_behind(self.retained, self._spec, now, room)
         if last_seq:
             self.watermark = last_seq

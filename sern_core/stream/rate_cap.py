@@ -9,7 +9,7 @@ RATE_CAP_SLACK: Final = 0.25
 
 
 class RateCap:
-    """At most `max_rate_hz` samples a second; None: all."""
+    """Lets at most `max_rate_hz` samples a second pass; None: all."""
 
     __slots__ = ("_next_allowed_s", "max_rate_hz")
 

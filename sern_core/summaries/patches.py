@@ -82,7 +82,7 @@ def _cut(changed: NDArray[np.bool_], at: Rectangle) -> tuple[int, Rectangle, Rec
 
 
 def changed_rectangles(before: NDArray[np.int8], after: NDArray[np.int8]) -> list[Rectangle]:
-    """At most MAX_RECTANGLES rectangles that hold every cell in which two grids of one shape differ."""
+    """The rectangles, MAX_RECTANGLES at most, that hold every cell in which two grids of one shape differ."""
     changed = before != after
     first = _bounds(changed, Rectangle(0, 0, changed.shape[1], changed.shape[0]))
     if first is None:

@@ -104,7 +104,7 @@ def checked_section(data: Mapping[str, Any], model: type[S]) -> S:
 
 
 def _without_echoes(details: list[ErrorDetails]) -> list[ErrorDetails]:
-    """Without "too short" for a list of which pydantic has only taken out the items that have errors of their own."""
+    """Leave out "too short" for a list of which pydantic has only taken out the items that have errors of their own."""
     locs = [item["loc"] for item in details]
     return [
         item

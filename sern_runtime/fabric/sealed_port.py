@@ -82,7 +82,7 @@ class SealedPort:
 
     @property
     def meetings(self) -> int:
-        """With how many processes of other relays it has keys, or tries to agree on some."""
+        """The number of processes of other relays that it has keys with, or tries to agree on some."""
         return sum(map(len, self._met.values()))
 
     async def start(self) -> None:
@@ -199,7 +199,7 @@ class SealedPort:
         self._events.peer_up(met.meeting.peer)
 
     def _expired(self, met: _Met) -> None:
-        """As a TLS connection ends with a certificate."""
+        """End a meeting whose certificate has expired, as a TLS connection ends with one."""
         _log.warning("relay %s: its certificate, or that of its authority, has expired", met.name)
         met.meeting.end()
         self._untell(met)

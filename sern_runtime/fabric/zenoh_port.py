@@ -147,7 +147,7 @@ class ZenohPort:
         return config
 
     def _stay_at_a_router(self) -> None:
-        """In the thread, until `close`. What else waits for the thread, waits for the session as well."""
+        """Stay at a router until `close`, in the thread: what else waits for that waits for the session as well."""
         routers, said, pause_s = list(self._options.peers), False, RETRY_FIRST_S
         while not self._leaving.is_set():
             try:
@@ -172,7 +172,7 @@ class ZenohPort:
             self._stir.clear()
 
     def _open_one_of(self, routers: Sequence[str]) -> str:
-        """In the thread. The first that answers; ZError: the last did not either."""
+        """Open a session at the first that answers, in the thread; ZError: the last did not either."""
         *others, last = routers
         for router in others:
             try:
@@ -186,7 +186,7 @@ class ZenohPort:
         return last
 
     def _open_at(self, router: str) -> None:
-        """In the thread. Raises ZError."""
+        """Open a session at a router, in the thread. Raises ZError."""
         try:
             self._open(self._config(replace(self._options, peers=(router,))))
         except self._zenoh.ZError:
@@ -195,7 +195,7 @@ class ZenohPort:
             raise
 
     def _forget_session(self) -> None:
-        """In the thread. What the session told is no longer so; it is closed beside, as zenoh may wait there."""
+        """Forget what the session told, in the thread. The session is closed beside, as zenoh may wait there."""
         self._opened += 1
         keeps, self._keeps = self._keeps, []
         session, self._session = self._session, None
@@ -213,7 +213,7 @@ class ZenohPort:
         self._wake()
 
     def _open(self, config: Any) -> None:
-        """In the thread. The inbox comes before the token: whoever sees that may send."""
+        """Open a session, in the thread. The inbox comes before the token: whoever sees that may send."""
         zenoh, options = self._zenoh, self._options
         session = self._session = zenoh.open(config)
         self._opened += 1

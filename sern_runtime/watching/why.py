@@ -251,7 +251,7 @@ class _Situation:
         return self._still(flow, changed)
 
     def _gone(self, owners: tuple[str, ...]) -> str:
-        """In words, that all who publish it are away; empty: they are not. Why is said once, beside the client."""
+        """Words that all who publish it are away; empty: they are not. Why is said once, beside the client."""
         lines = [self._clients.get(owner) for owner in owners]
         away = [line for line in lines if line is not None and line.state in AWAY]
         if not owners or len(away) < len(owners):
@@ -330,7 +330,7 @@ def _of_spool(said: Json) -> Iterator[Word]:
 
 
 def _at_relay(said: Json) -> Iterator[Word]:
-    """At which of several relays a client is."""
+    """Words of which of several relays a client is at."""
     if len(said.get("relays", ())) < 2:
         return
     moves = f"; it moved {said['moves']} times" if said["moves"] else ""

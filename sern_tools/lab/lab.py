@@ -158,7 +158,7 @@ class Lab:
         return self
 
     def _await_passing(self) -> None:
-        """Between each node and the first of the other side."""
+        """Wait until datagrams pass between each node and the first of the other side."""
         left, right = ([self[end.name] for end in self._endpoints if end.side == side] for side in (0, 1))
         across = [(one, other) for one in left for other in right if one is left[0] or other is right[0]]
         with ExitStack() as stack:

@@ -369,7 +369,7 @@ class Ros1Endpoint:
             self._services.update(state.services)
 
     def _tell_subscribers(self, publication: Publication) -> None:
-        """Once the master lists us: its subscribers connect now, or have."""
+        """Tell a publication its subscribers, once the master lists us: they connect now, or have."""
         name = publication.topic
         if self.caller in self._state.publishers.get(name, ()):
             publication.registered(set(self._state.subscribers.get(name, ())) - {self.caller})

@@ -53,7 +53,7 @@ class HttpReader:
         return self._take(self._length) if len(self._buffer) >= self._length else None
 
     def finish(self) -> HttpMessage | None:
-        """At the end of the connection: the answer that only this ends, if there is one."""
+        """The answer that only the end of the connection ends, if there is one; call this at that end."""
         if self._answers and self._headers is not None and self._length is None:
             return self._take(len(self._buffer))
         return None

@@ -233,7 +233,7 @@ class Publication:
         self._judge()
 
     def _judge(self) -> None:
-        """Without a stream it ends, once the subscribers it has messages for have come or are given up."""
+        """End without a stream, once the subscribers that it has messages for have come or are given up."""
         if self.handles:
             return
         if self.first_messages.over or not len(self.first_messages):

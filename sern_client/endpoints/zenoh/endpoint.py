@@ -192,7 +192,7 @@ class ZenohEndpoint:
         return sum(kind == (dds_name, type_hash) for kind in self._subscribers.get(name, {}).values())
 
     def validate(self, held: Held) -> list[Difference]:
-        """Without the thread that writes nothing is published: that is a difference of every topic."""
+        """What differs from `held`. A thread that does not write publishes nothing: a difference of every topic."""
         found = held.differences(Held(self._streams.names, self.subscriptions.names))
         found += self.subscriptions.differences()
         if (problem := self.session.problem) is not None:

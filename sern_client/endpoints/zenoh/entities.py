@@ -97,5 +97,5 @@ class Writer:
         self._session.put(put, len(body))
 
     def close(self) -> None:
-        """After what was published before."""
+        """Close it after what was published before has left."""
         self._declared.end()

@@ -203,7 +203,7 @@ class ZenohSession:
             self._wake.notify()
 
     def _shed(self) -> None:
-        """Under the lock: the oldest messages go. What has no bytes is an end of something, and must be told."""
+        """Drop the oldest messages, under the lock. What has no bytes is an end of something, and must be told."""
         kept: deque[tuple[Callable[[], None], int]] = deque()
         while self._waiting_bytes > MAX_WAITING_BYTES and len(self._waiting) > 1:
             item = self._waiting.popleft()

@@ -176,7 +176,7 @@ class Slowdown:
         self._full = None
 
     def arrives(self, receiver_s: float, cum_bytes: int) -> float | None:
-        """While a queue stays the link is never idle: the bytes/s that arrived over a span; None: it goes on."""
+        """The bytes/s that arrived over a span with a queue throughout: the link was never idle. None: it goes on."""
         full = self._full
         if full is None:
             self._full = (receiver_s, cum_bytes)

@@ -104,8 +104,8 @@ class PathModel:
     # --- the rate -------------------------------------------------------------------------------------------------
 
     def slower_rate(self, sample: AckSample) -> float | None:
-        """While a queue stays the link is never idle: what arrives is all it can do, whatever was seen before. Returns
-        that, in bytes/s, where it is clearly less than what is known."""
+        """What arrives while a queue stays, in bytes/s, where it is clearly less than what is known: the link is never
+        idle then, and this is all it can do, whatever was seen before."""
         rate = self.slowdown.arrives(sample.receiver_s, sample.cum_bytes)
         known = self.rate.value
         if rate is not None and known is not None and 0.0 < rate < self._params.slower * known:

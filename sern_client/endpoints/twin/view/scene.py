@@ -61,7 +61,7 @@ _CUBE_FACES: Final = np.array(
 
 
 class Camera(NamedTuple):
-    """From where to look, and at what, in the scene."""
+    """The place from where to look, and what to look at, in the scene."""
 
     position: Point
     look_at: Point
