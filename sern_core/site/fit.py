@@ -29,8 +29,8 @@ MAX_WATCHED: Final = 64
 GROWS: Final = 1.1
 """The link is a faster one when it is known to carry so many times what it was before the last that was in vain."""
 FAR_TOO_LARGE: Final = 4.0
-"""A message is if it would take so many of its lifespans though it had all of the link; a codec seldom makes so little
-of it that it arrives."""
+"""A message is far too large if it takes so many of its lifespans with the link to itself: a codec seldom makes so
+little of it that it arrives."""
 TOO_LARGE: Final = frozenset({DropReason.TOO_SLOW, DropReason.LIFESPAN})
 """What the fate of a message is called that the link could not carry in time."""
 

@@ -27,7 +27,6 @@ class LinkRate:
         "arrived",
         "burst",
         "bursts",
-        "by_bursts",
         "peak",
         "saturated",
         "shown",
@@ -42,9 +41,7 @@ class LinkRate:
         self.shown = False
         """Whether `value` says what the link can do, and not what little was offered."""
         self.bursts = 0
-        """How many were measured, while nothing else showed it."""
-        self.by_bursts = False
-        """Whether bursts with pauses between them are all that shows it."""
+        """How many bursts were measured since anything else showed it; 0: something else does."""
         self.peak = 0.0
         self.measure_anew()
 
@@ -65,7 +62,7 @@ class LinkRate:
         """Nothing is known of the link; what begins anew shows little at first."""
         self._rates.clear()
         self.value = None
-        self.saturated = self.shown = self.by_bursts = False
+        self.saturated = self.shown = False
         self.bursts = 0
         self.measure_anew()
 
@@ -91,7 +88,7 @@ class LinkRate:
             return None  # the receiver names newer packets and no more bytes: that says nothing of the path
         limited = self._span_limited
         if not self._span_idle:
-            self.shown, self.by_bursts = True, False
+            self.shown, self.bursts = True, 0
         self._mark = (receiver_s, cum_bytes)
         self._span_limited = app_limited or held  # nothing more was there when this packet left: the next begins idle
         self._span_idle = app_limited
@@ -113,7 +110,6 @@ class LinkRate:
             return
         rate = (cum_bytes - began[1]) / (receiver_s - began[0] + spread_s)
         if not self.saturated or self.value is None:
-            self.by_bursts = True
             self.bursts += 1
             self.show(now, rate, rtt_s)
         elif rate > BURST_TIMES * self.value:
@@ -136,7 +132,7 @@ class LinkRate:
         """There is more to send than the link takes: what bursts showed is forgotten."""
         if not self.saturated:
             self.saturated = self.shown = True
-            self.by_bursts = False
+            self.bursts = 0
             self._rates.clear()
 
     def note(self, now: float, rate: float, rtt_s: float) -> None:

@@ -61,7 +61,7 @@ class Pace:
                     gain = params.calm_pacing + params.calm_share * max(0.0, 1 - carried / rate.peak)
             if view.calm:
                 carried /= 1 - loss  # what arrives is less than what was sent
-            if rate.by_bursts:
+            if rate.bursts:
                 gain = max(gain, params.burst_pacing)
             self.capped = view.calm and gain * carried < pace
             self.value = max(min(pace, gain * carried), 1.0)

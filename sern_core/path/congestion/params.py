@@ -68,13 +68,13 @@ class HybridParams:
     startup_pacing: float = 4.0
     startup_aim: float = 0.9
     startup_share: float = 0.75
-    """Of the window, which a round ends with."""
+    """A round ends when this share of its window has been acknowledged."""
     startup_longer: float = 0.25
-    """A round is of a full window if packets took so many times as long as in the quickest one..."""
+    """A window is full if packets took longer by this share of what they took in the quickest round..."""
     startup_far: float = 2.0
-    """... far more than full if they took so many times as long..."""
+    """... and far more than full if they took so many times as long."""
     startup_rounds: int = 2
-    """... and so many in a row show that it is, where packets come unevenly."""
+    """So many rounds in a row show that it is full, where packets come unevenly."""
 
     # Pacing
     pacing_gain: float = 1.03

@@ -8,6 +8,7 @@ from sern_core.path.congestion.params import HybridParams
 from sern_core.path.congestion.train import TRAIN_BYTES, Train
 
 LOST: Final = 0.2
+"""A path that loses more than this share in an epoch drops what it cannot keep."""
 RTT_WEIGHT: Final = 0.1
 """Share of a packet in what the round knows of the round trip; more of the first ones, so that they are a mean."""
 

@@ -85,7 +85,7 @@ def test_what_little_was_offered_is_no_rate_to_go_by() -> None:
 def test_a_pace_above_what_bursts_showed_lets_them_show_more() -> None:
     path = Path()
     path.epoch(0.0, app_limited=True)
-    path.model.rate.by_bursts = True
+    path.model.rate.bursts = 1
     path.model.rate.show(path.now, 900e3, RTT_S)
     path.epoch(0.1, app_limited=True)
     pace = pacing(path)
