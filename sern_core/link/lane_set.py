@@ -165,6 +165,8 @@ class LaneSet:
         if lane is old:
             return
         self.lane = lane
+        if old.usable and lane.lossless:
+            lane.estimator.goes_on_from(old.estimator, now=now)
         if not old.usable:  # else it delivers what it has, or gives back what it loses
             self.recall(old, now)
         self._tell(now, TraceEvent.LANE_USED, lane=lane.name, what="data")

@@ -113,6 +113,10 @@ class CapacityEstimator(ABC):
     def on_reset(self, *, now: float) -> None:
         """The transport was replaced: what is in flight is gone, the path may be another."""
 
+    def goes_on_from(self, other: "CapacityEstimator", *, now: float) -> None:  # noqa: B027
+        """The lane of `other` has carried the data over the same path until now, and this one does from now on: what
+        the one has found need not be found again."""
+
     @abstractmethod
     def on_stall(self, *, now: float) -> None:
         """No acknowledgement for too long; capacity is zero until the next one."""

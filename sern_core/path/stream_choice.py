@@ -85,10 +85,10 @@ class StreamChoice:
         carried_bps = 8 * (lane.path.arrived_bytes - self._begin_bytes) / elapsed_s
         if not self.stream:
             self._consider(lane, carried_bps, now)
-        elif carried_bps < IDLE * self._from_bps:
-            self.stream = False
         elif carried_bps < self._expected_bps / 2 and 2 * self._held > self._looks:
             self._fail(now)
+        elif carried_bps < IDLE * self._from_bps:
+            self.stream = False
         elif now - self._since_s >= PROVEN_S:
             self._rest_s = REST_S
         self._measure(lane, now)

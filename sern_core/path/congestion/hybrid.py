@@ -54,6 +54,9 @@ from sern_core.path.congestion.unqueued import Unqueued
 
 SOONER_ROOM: Final = 4
 """Packets."""
+TAKE_UP_S: Final = 0.25
+"""TCP that was idle begins with few segments, and takes some round trips to carry what the link does (slow start,
+RFC 5681): what waits in it meanwhile is no queue of the path."""
 
 
 class HybridWindow(CapacityEstimator):
@@ -247,6 +250,21 @@ class HybridWindow(CapacityEstimator):
 
     def on_reset(self, *, now: float) -> None:
         self._begin()
+
+    def goes_on_from(self, other: CapacityEstimator, *, now: float) -> None:
+        """Only where that was steady, and this has not found somebody else or a swinging link by itself."""
+        if not isinstance(other, HybridWindow) or other._mode is not STEADY or not other._rate.shown:
+            return
+        if self._mode is STARTUP:
+            self._happens(Event.FILLED)
+        elif self._mode is not STEADY:
+            return
+        self._window = max(self._window, other._window)
+        self._rate.adopt(other._rate, now, self._path.rtt_s or 0.0)
+        self._growth.restart(now)
+        self._backoff.hold_until_s = now + TAKE_UP_S
+        self._busy_s = now
+        self._pace.set(self._mode, self._window)
 
     def on_stall(self, *, now: float) -> None:
         self._rate.stalled()

@@ -144,6 +144,13 @@ class LinkRate:
         self.shown = True
         self.note(now, rate, rtt_s)
 
+    def adopt(self, other: "LinkRate", now: float, rtt_s: float) -> None:
+        """The link carries what another lane has seen there."""
+        if other.value is not None:
+            self.saturated, self.shown, self.bursts = other.saturated, other.shown, other.bursts
+            self.replace(now, other.value, rtt_s)
+            self.peak = other.peak
+
     def replace(self, now: float, rate: float, rtt_s: float) -> None:
         """The link carries `rate`, whatever was seen before."""
         self._rates.clear()

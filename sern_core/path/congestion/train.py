@@ -15,6 +15,8 @@ EVEN: Final = 0.16
 """Packets come evenly if the share of them that has come is nowhere off by more from the share of the time. Behind a
 bottleneck they do. Where jitter alone spreads them they come in clumps, since who is held up holds up those behind:
 nine packets are off by .2 at least, 99 times of 100."""
+EVEN_ARRIVALS: Final = 5
+"""Fewer acknowledgements are even by chance, and two always."""
 PAUSE_RTTS: Final = 0.25
 """A sender that has nothing to send for so many round trips pauses: what comes then is another train."""
 NO_TIME_S: Final = 1e-5
@@ -96,11 +98,11 @@ class Train:
         packets.append(packet)
         self.nbytes += sample.acked_bytes
         self._note_whole(packet)
-        while len(packets) > 2 and packet.cum_bytes - packets[1].cum_bytes >= TRAIN_BYTES:
+        while len(packets) > EVEN_ARRIVALS and packet.cum_bytes - packets[1].cum_bytes >= TRAIN_BYTES:
             packets.popleft()
         first = packets[0]
         nbytes, span_s = packet.cum_bytes - first.cum_bytes, packet.at_s - first.at_s
-        if nbytes < TRAIN_BYTES:
+        if nbytes < TRAIN_BYTES or len(packets) < EVEN_ARRIVALS:
             return False
         if span_s > STALL_S and any(later.at_s - earlier.at_s > 0.6 * span_s for earlier, later in pairwise(packets)):
             packets.clear()  # a stream stood still for a lost segment: that says nothing about its rate
