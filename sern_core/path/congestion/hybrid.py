@@ -388,7 +388,8 @@ class HybridWindow(CapacityEstimator):
             told = (self._path.epoch_s or now) >= self._resumed_s + 2 * seen.rtt_s
             # Packets that jitter holds up have not queued.
             long_s = self._view.high_s * (3.0 if self._start.jittery else 0.5)
-            queued = seen.queue_s > long_s and self._start.rate > 0.0
+            # The first round is what it is. On a stream that begins half of it waits in TCP for the other half.
+            queued = seen.queue_s > long_s and self._start.rate > 0.0 and self._start.rounds > 0
             if seen.limited and (queued or (told and self._start.loses(losses.unusual(lost, self._path.fragment)))):
                 # What came lately may have been little, since there was little to send.
                 rate = max(self._rate.arrived.rate() or 0.0, self._start.rate)

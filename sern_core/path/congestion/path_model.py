@@ -32,7 +32,10 @@ class PathModel:
     """
 
     __slots__ = (
+        "_before_s",
         "_first_fragment_bytes",
+        "_grew",
+        "_known_fragment",
         "_limited",
         "_params",
         "_samples",
@@ -52,6 +55,11 @@ class PathModel:
         self._first_fragment_bytes = fragment_bytes
         self.fragment = float(fragment_bytes)
         """Bytes of the largest packet that there is to send."""
+        self._known_fragment = float(fragment_bytes)
+        """Of which size it is known how jitter holds it."""
+        self._grew = False
+        self._before_s: float | None = None
+        """The queue before packets grew, in the epoch after that; None: they did not."""
         self.rate = LinkRate(params)
         self.delay = PathDelay(params)
         self.view = QueueView(params)
@@ -80,6 +88,8 @@ class PathModel:
         if rate.peak and rate.saturated:
             self.delay.longer_packets((nbytes - self.fragment) / rate.peak)
         self.fragment = float(nbytes)
+        if nbytes >= 2 * self._known_fragment:
+            self._grew = True
 
     def note(self, sample: AckSample) -> float:
         """Measure one acknowledgement. Returns how long its packet has queued."""
@@ -137,6 +147,9 @@ class PathModel:
         queues = sorted([queue_s for queue_s, _ in self._samples])
         backs = sorted([back_s for _, back_s in self._samples])
         count = len(queues)
+        held_s = self._held_longer_s(queues[count // 5])
+        if held_s:
+            queues = [queue_s - held_s for queue_s in queues]
         early_s = -queues[count // 5]
         early = early_s > view.high_s
         delay.close_epoch(now, memory_s)
@@ -149,6 +162,23 @@ class PathModel:
         view.close_epoch(queues, rtt_s, self.rate, fragment, usual=usual, limited=limited, steered=steered)
         self._look_for_end_of_queue(now, window)
         return Seen(view.queue_s, rtt_s, limited, early, quicker)
+
+    def _held_longer_s(self, queue_s: float) -> float:
+        """By how much jitter holds the packets of an epoch longer than those before, because they are larger: a
+        fragment of a stream comes with the last of its segments, each of which jitter may hold. A window does not
+        change so much in an epoch that this were its queue."""
+        before_s, self._before_s = self._before_s, None
+        if self._grew:
+            self._grew = False
+            self._known_fragment = self.fragment
+            self._before_s = self.view.queue_s
+        if before_s is None or not self.view.jitters:
+            return 0.0
+        held_s = min(queue_s - before_s, self._params.held_spreads * self.view.jitter_s)
+        if held_s <= 0.0:
+            return 0.0
+        self.delay.held_s += held_s
+        return held_s
 
     def begin_epoch(self, now: float) -> None:
         """What was seen of the last one has been dealt with."""
@@ -181,6 +211,7 @@ class PathModel:
     def _shorten_fragment(self) -> None:
         """The fragments of a stream get shorter with its rate."""
         self.fragment = min(self.fragment, max(self.longest, self._first_fragment_bytes))
+        self._known_fragment = min(self._known_fragment, self.fragment)
 
     def longer_path(self, now: float, queue_s: float) -> None:
         """What looked like a queue is a longer way."""

@@ -109,6 +109,11 @@ class QueueView:
         return self.jittery or self._steered_epochs < KNOWN_EPOCHS
 
     @property
+    def jitters(self) -> bool:
+        """Whether there is jitter for all that is known: start-up has met it just now, or it is seen since."""
+        return self.jittery or self._learned_epochs < KNOWN_EPOCHS
+
+    @property
     def long(self) -> bool:
         """Whether the queue is to go at once."""
         return self.queue_s > self.high_s

@@ -41,6 +41,7 @@ class StartUp:
         "_train",
         "_window",
         "jittery",
+        "rounds",
         "since_s",
     )
 
@@ -60,6 +61,8 @@ class StartUp:
         self._first_window = window
         self._train = Train()
         self._full_rounds = self._lossy_epochs = 0
+        self.rounds = -1
+        """How many are over."""
         self._least_rtt_s = inf  # the least mean of a round: with hardly a queue of ours
         self.begin_round(now, window, pace)
         self._resumed = resumed
@@ -70,6 +73,7 @@ class StartUp:
         if self.jittery and self._train.whole_bytes >= 2 * TRAIN_BYTES and self._train.whole_rate < inf:
             self._shown = max(self._shown, self._train.whole_rate)
         self._before = self.rate
+        self.rounds += 1
         self._resumed = False
         self.since_s = now
         self._window = window
@@ -103,9 +107,12 @@ class StartUp:
         """One acknowledgement of a packet of the round, which left at `left_s`; None: it shows nothing new."""
         train = self._train
         self._note_rtt(sample.rtt_s)
-        if not train.note(sample, left_s, rtt_s):
+        if not train.note(sample, left_s, rtt_s, jittery=self.jittery):
             return None
-        if self._may_jitter and not train.even:
+        told = train.tells and (train.spread or not train.even)
+        if self._may_jitter and not told and train.nbytes < self._window:
+            return None
+        if self._may_jitter and not (told and train.even):
             self.jittery = True
             return self._jittery_ramp(window, fragment)
         # By chance a few of many packets that jitter spreads come evenly: no link is slower than all of a round.

@@ -11,12 +11,14 @@ from sern_core.path.capacity import AckSample
 TRAIN_BYTES: Final = 8 * 1200
 TRAIN_SPREAD: Final = 1.1
 """A train was spread by the path if it takes so many times as long to arrive as it took to leave."""
-EVEN: Final = 0.16
+EVEN: Final = (0.0, 0.0, 0.0, 0.0, 0.05, 0.10, 0.16)
 """Packets come evenly if the share of them that has come is nowhere off by more from the share of the time. Behind a
 bottleneck they do. Where jitter alone spreads them they come in clumps, since who is held up holds up those behind:
-nine packets are off by .2 at least, 99 times of 100."""
-EVEN_ARRIVALS: Final = 5
-"""Fewer acknowledgements are even by chance, and two always."""
+nine packets are off by .2 at least, 99 times of 100. Fewer acknowledgements, by whose number this is, are even by
+chance, and two always."""
+EVEN_ARRIVALS: Final = len(EVEN) - 1
+UNEVEN_ARRIVALS: Final = 9
+"""So many where packets came unevenly before."""
 PAUSE_RTTS: Final = 0.25
 """A sender that has nothing to send for so many round trips pauses: what comes then is another train."""
 NO_TIME_S: Final = 1e-5
@@ -47,6 +49,7 @@ class Train:
         "rate",
         "span_s",
         "spread",
+        "tells",
         "whole_bytes",
     )
 
@@ -57,6 +60,8 @@ class Train:
         """Bytes/s, the greatest of the round; and the greatest by packets that came evenly."""
         self.even = False
         """Whether the latest packets came evenly."""
+        self.tells = False
+        """Whether the latest packets are enough to tell whether they came evenly."""
         self.spread = True
         """Whether they arrived farther apart than they left: by the bottleneck, not by our sending."""
         self._packets: deque[Arrival] = deque()
@@ -87,8 +92,10 @@ class Train:
         """There was nothing more to send behind a packet that left then."""
         self._idle_since_s = left_s
 
-    def note(self, sample: AckSample, left_s: float, rtt_s: float) -> bool:
-        """Whether it was enough to tell a rate by. The packet left at `left_s`."""
+    def note(self, sample: AckSample, left_s: float, rtt_s: float, *, jittery: bool = False) -> bool:
+        """Whether it was enough to tell a rate by. The packet left at `left_s`. `jittery`: packets came unevenly
+        before."""
+        many = UNEVEN_ARRIVALS if jittery else EVEN_ARRIVALS
         packet = Arrival(sample.receiver_s, sample.cum_bytes, sample.sent_s, sample.overtook)
         packets = self._packets
         if left_s - self._idle_since_s > PAUSE_RTTS * rtt_s:
@@ -98,11 +105,11 @@ class Train:
         packets.append(packet)
         self.nbytes += sample.acked_bytes
         self._note_whole(packet)
-        while len(packets) > EVEN_ARRIVALS and packet.cum_bytes - packets[1].cum_bytes >= TRAIN_BYTES:
+        while len(packets) > many and packet.cum_bytes - packets[1].cum_bytes >= TRAIN_BYTES:
             packets.popleft()
         first = packets[0]
         nbytes, span_s = packet.cum_bytes - first.cum_bytes, packet.at_s - first.at_s
-        if nbytes < TRAIN_BYTES or len(packets) < EVEN_ARRIVALS:
+        if nbytes < TRAIN_BYTES:
             return False
         if span_s > STALL_S and any(later.at_s - earlier.at_s > 0.6 * span_s for earlier, later in pairwise(packets)):
             packets.clear()  # a stream stood still for a lost segment: that says nothing about its rate
@@ -112,7 +119,9 @@ class Train:
         self.rate = max(self.rate, rate)
         off = max(abs((by.at_s - first.at_s) * nbytes - (by.cum_bytes - first.cum_bytes) * span_s) for by in packets)
         in_order = not any(by.overtook for by in packets)
-        self.even = in_order and span_s > NO_TIME_S and off <= EVEN * nbytes * span_s
+        tolerance = 0.0 if jittery and len(packets) < many else EVEN[min(len(packets), EVEN_ARRIVALS)]
+        self.tells = tolerance > 0.0
+        self.even = in_order and span_s > NO_TIME_S and off <= tolerance * nbytes * span_s
         if self.even:
             self.even_rate = max(self.even_rate, rate)
         last_s, first_s = packet.sent_s, first.sent_s
