@@ -1,5 +1,6 @@
 """What is known of the path: how long it is, what it takes, and what queues on it (the network path model of BBR)."""
 
+from math import inf
 from typing import NamedTuple
 
 from sern_core.path.capacity import AckSample
@@ -34,8 +35,10 @@ class PathModel:
     __slots__ = (
         "_before_s",
         "_first_fragment_bytes",
+        "_gaps",
         "_grew",
         "_known_fragment",
+        "_last",
         "_limited",
         "_params",
         "_samples",
@@ -73,6 +76,8 @@ class PathModel:
         self.epoch_s: float | None = None
         """When the epoch began; None: with the next acknowledgement."""
         self._samples: list[tuple[float, float]] = []  # (queue, way back) of the epoch
+        self._gaps: list[float] = []  # seconds a byte between acknowledgements of the epoch, at the receiver
+        self._last: tuple[float, int] | None = None  # (time, bytes) at the receiver, of the latest of them
         self._limited = 0  # acknowledgements of packets after which there was more to send
         self.longest = 0
         """Bytes of the longest packet of the epoch."""
@@ -106,6 +111,9 @@ class PathModel:
         if carried is not None and rate.saturated:
             queued = not sample.app_limited or queue_s > self.fragment / carried
             self.eased.note(sample.now, receiver_s - sent_s, nbytes or self.fragment, carried, queued=queued)
+        last, self._last = self._last, (receiver_s, sample.cum_bytes)
+        if last is not None and sample.cum_bytes > last[1] and receiver_s >= last[0]:
+            self._gaps.append((receiver_s - last[0]) / (sample.cum_bytes - last[1]))
         if not sample.app_limited:
             self._limited += 1
         rate.arrived.note(receiver_s, sample.cum_bytes)
@@ -159,7 +167,11 @@ class PathModel:
         self.rate.decay(now - (self.epoch_s or now))
         usual = fragment <= self._first_fragment_bytes
         limited = 2 * self._limited >= count
-        view.close_epoch(queues, rtt_s, self.rate, fragment, usual=usual, limited=limited, steered=steered)
+        gaps = sorted(self._gaps)
+        packet_s = fragment * gaps[(len(gaps) - 1) // 2] if gaps else inf
+        view.close_epoch(
+            queues, rtt_s, self.rate, fragment, packet_s=packet_s, usual=usual, limited=limited, steered=steered
+        )
         self._look_for_end_of_queue(now, window)
         return Seen(view.queue_s, rtt_s, limited, early, quicker)
 
@@ -183,6 +195,7 @@ class PathModel:
     def begin_epoch(self, now: float) -> None:
         """What was seen of the last one has been dealt with."""
         self._samples.clear()
+        self._gaps.clear()
         self._limited = self.longest = 0
         self.epoch_s = now
 

@@ -62,11 +62,13 @@ class QueueView:
         rate: LinkRate,
         fragment: float,
         *,
+        packet_s: float,
         usual: bool,
         limited: bool,
         steered: bool,
     ) -> None:
-        """See the queues of an epoch, sorted. `usual`: the largest packet is of the size that was planned for.
+        """See the queues of an epoch, sorted. `packet_s`: so closely the largest packets followed each other, most of
+        the time: the link does not take longer for one, however little we have sent. `usual`: the largest packet is of the size that was planned for.
         `limited`: there was more to send; `steered`: the queue was kept short. With neither, what spreads the queue may
         be what was sent at once now and again."""
         params = self._params
@@ -84,13 +86,12 @@ class QueueView:
         serialise_s = self.serialise_s = fragment / rate.peak if rate.peak else 0.0
         self._spreads.append(spread_s)
         own_s = fragment / rate.value if rate.value else 0.0
-        noise_s = params.noise * max(0.0, self.jitter_s - serialise_s)
+        packet_s = min(packet_s, serialise_s)
+        noise_s = params.noise * max(0.0, self.jitter_s - packet_s)
         # A slower flow wants a longer queue than a faster one, so that their shares meet.
         self.calm = noise_s <= params.calm_noise_s and serialise_s <= params.calm_packet_s
         self.least_spread_s = sorted(self._spreads)[len(self._spreads) // 8]
-        self.jittery = self.least_spread_s > (
-            params.calm_noise_s if serialise_s <= params.calm_packet_s else serialise_s
-        )
+        self.jittery = self.least_spread_s > (params.calm_noise_s if packet_s <= params.calm_packet_s else packet_s)
         # Fragments of a stream grow with its rate, and TCP cuts them anew: what they take is not known so well.
         self.gentle = self.calm and serialise_s >= params.gentle_packet_s and usual
         packets = params.gentle_packets if self.gentle else params.calm_packets if self.calm else params.target_packets
