@@ -58,13 +58,14 @@ class Growth:
         fragment: float,
         capped: bool,
         alone: bool,
+        segmented: bool = False,
     ) -> float:
         """The window after an epoch whose queue was not too long. `lost`: share that was lost in it; `alone`: no rival
-        was seen lately."""
+        was seen lately; `segmented`: packets are of many segments each, and come with the last of them."""
         queue_s = self._view.queue_s
         if alone:
             queue_s = self._without_jitter(
-                now, window, queue_s, rate, self._losses.unusual(lost, fragment), capped=capped
+                now, window, queue_s, rate, self._losses.unusual(lost, fragment), capped=capped, segmented=segmented
             )
         else:
             self.room.clear()
@@ -101,13 +102,14 @@ class Growth:
         return max(window, min(window + min(step, params.max_growth * window), most))
 
     def _without_jitter(
-        self, now: float, window: float, queue_s: float, rate: float, unusual: float, *, capped: bool
+        self, now: float, window: float, queue_s: float, rate: float, unusual: float, *, capped: bool, segmented: bool
     ) -> float:
         """The queue without what jitter holds packets back. In order they wait for those before them, the longer the
         closer they follow each other: that is in no delay of slower times, and is no queue. `unusual`: share that was
         lost and is not usually."""
         room, view, delay, params = self.room, self._view, self._delay, self._params
-        tries = (view.jittery and not view.calm) or now < self._changed_s + params.base_window_s
+        jitters = segmented or (view.jittery and not view.calm)
+        tries = jitters or now < self._changed_s + params.base_window_s
         if not (tries or room.trying):
             room.clear()
             return queue_s
@@ -127,9 +129,10 @@ class Growth:
             queue_s += delay.held_s
             delay.held_s = 0.0
             room.clear()
-        if not has_room or view.calm or not view.jittery:
+        if not has_room or not jitters:
             return queue_s
-        held_s = min(room.queue_s - view.target_s / 2, params.held_spreads * view.least_spread_s - delay.held_s)
+        most_s = params.segmented_spreads * view.jitter_s if segmented else params.held_spreads * view.least_spread_s
+        held_s = min(room.queue_s - view.target_s / 2, most_s - delay.held_s)
         if held_s <= 0.0:
             return queue_s
         delay.held_s += held_s

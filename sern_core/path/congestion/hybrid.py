@@ -440,8 +440,9 @@ class HybridWindow(CapacityEstimator):
             if alone:
                 rival.calm_window = window
             window = self._growth.steer(
-                now, window, seen.rtt_s, rate, lost=lost, fragment=path.fragment, capped=capped, alone=alone
-            )
+                now, window, seen.rtt_s, rate,
+                lost=lost, fragment=path.fragment, capped=capped, alone=alone, segmented=path.segmented,
+            )  # fmt: skip
         self._window = min(max(window, self._least_window), params.max_window_bytes)
 
     # --- somebody else --------------------------------------------------------------------------------------------

@@ -119,6 +119,11 @@ class PathModel:
         rate.arrived.note(receiver_s, sample.cum_bytes)
         return queue_s
 
+    @property
+    def segmented(self) -> bool:
+        """Whether a packet is of many segments, as a fragment of a stream."""
+        return self.fragment >= 2 * self._first_fragment_bytes
+
     # --- the rate -------------------------------------------------------------------------------------------------
 
     def slower_rate(self, sample: AckSample) -> float | None:
@@ -186,7 +191,7 @@ class PathModel:
             self._before_s = self.view.queue_s
         if before_s is None or not self.view.jitters:
             return 0.0
-        held_s = min(queue_s - before_s, self._params.held_spreads * self.view.jitter_s)
+        held_s = min(queue_s - before_s, self._params.segmented_spreads * self.view.jitter_s)
         if held_s <= 0.0:
             return 0.0
         self.delay.held_s += held_s
