@@ -233,6 +233,8 @@ class Lane:
         came_bytes = self.arrivals.cum_bytes
         idle = only_asked and not self.stalled and came_bytes - self._came_bytes <= IDLE_BYTES
         interval_s = PING_GROWTH * self._ping_interval_s if idle else PING_INTERVAL_S
+        if not self.lossless and self.proofs < PROVEN_ACKS and not self.stalled_at_s:
+            interval_s = PROBE_INTERVAL_S  # a lane that is new is to carry data soon; one that failed may wait
         self._ping_interval_s = min(interval_s, self._ping_interval_max_s)
         self._came_bytes = came_bytes
         self.ping_due_s = now + self._ping_interval_s

@@ -54,6 +54,8 @@ from sern_core.path.congestion.unqueued import Unqueued
 
 SOONER_ROOM: Final = 4
 """Packets."""
+SLOW_START_RTTS: Final = 1.5
+"""A stream that begins has half of the first window wait in TCP until the other half has arrived."""
 TAKE_UP_S: Final = 0.25
 """TCP that was idle begins with few segments, and takes some round trips to carry what the link does (slow start,
 RFC 5681): what waits in it meanwhile is no queue of the path."""
@@ -388,8 +390,9 @@ class HybridWindow(CapacityEstimator):
             told = (self._path.epoch_s or now) >= self._resumed_s + 2 * seen.rtt_s
             # Packets that jitter holds up have not queued.
             long_s = self._view.high_s * (3.0 if self._start.jittery else 0.5)
-            # The first round is what it is. On a stream that begins half of it waits in TCP for the other half.
-            queued = seen.queue_s > long_s and self._start.rate > 0.0 and self._start.rounds > 0
+            if not self._start.rounds:
+                long_s = max(long_s, SLOW_START_RTTS * seen.rtt_s)
+            queued = seen.queue_s > long_s and self._start.rate > 0.0
             if seen.limited and (queued or (told and self._start.loses(losses.unusual(lost, self._path.fragment)))):
                 # What came lately may have been little, since there was little to send.
                 rate = max(self._rate.arrived.rate() or 0.0, self._start.rate)

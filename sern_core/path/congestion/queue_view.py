@@ -68,9 +68,9 @@ class QueueView:
         steered: bool,
     ) -> None:
         """See the queues of an epoch, sorted. `packet_s`: so closely the largest packets followed each other, most of
-        the time: the link does not take longer for one, however little we have sent. `usual`: the largest packet is of the size that was planned for.
-        `limited`: there was more to send; `steered`: the queue was kept short. With neither, what spreads the queue may
-        be what was sent at once now and again."""
+        the time: the link does not take longer for one, however little we have sent. `usual`: the largest packet is of
+        the size that was planned for. `limited`: there was more to send; `steered`: the queue was kept short. With
+        neither, what spreads the queue may be what was sent at once now and again."""
         params = self._params
         count = len(queues)
         fifth_s, self.most_s = queues[count // 5], queues[count * 4 // 5]

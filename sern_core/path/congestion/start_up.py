@@ -9,6 +9,7 @@ from sern_core.path.congestion.train import TRAIN_BYTES, Train
 
 LOST: Final = 0.2
 """A path that loses more than this share in an epoch drops what it cannot keep."""
+CLOCKED_RTTS: Final = 2.0
 RTT_WEIGHT: Final = 0.1
 """Share of a packet in what the round knows of the round trip; more of the first ones, so that they are a mean."""
 
@@ -109,7 +110,9 @@ class StartUp:
         self._note_rtt(sample.rtt_s)
         if not train.note(sample, left_s, rtt_s, jittery=self.jittery):
             return None
-        told = train.tells and (train.spread or not train.even)
+        # As they had left, within two round trips: it was the window that spaced them.
+        clocked = train.even and not train.spread and train.took_s < CLOCKED_RTTS * rtt_s
+        told = train.tells and not clocked
         if self._may_jitter and not told and train.nbytes < self._window:
             return None
         if self._may_jitter and not (told and train.even):

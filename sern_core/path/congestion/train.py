@@ -50,6 +50,7 @@ class Train:
         "span_s",
         "spread",
         "tells",
+        "took_s",
         "whole_bytes",
     )
 
@@ -60,6 +61,8 @@ class Train:
         """Bytes/s, the greatest of the round; and the greatest by packets that came evenly."""
         self.even = False
         """Whether the latest packets came evenly."""
+        self.took_s = 0.0
+        """How long they took to arrive."""
         self.tells = False
         """Whether the latest packets are enough to tell whether they came evenly."""
         self.spread = True
@@ -115,13 +118,14 @@ class Train:
             packets.clear()  # a stream stood still for a lost segment: that says nothing about its rate
             self._begin_whole()
             return False
+        self.took_s = span_s
         rate = nbytes / span_s if span_s > NO_TIME_S else inf
         self.rate = max(self.rate, rate)
         off = max(abs((by.at_s - first.at_s) * nbytes - (by.cum_bytes - first.cum_bytes) * span_s) for by in packets)
         in_order = not any(by.overtook for by in packets)
         tolerance = 0.0 if jittery and len(packets) < many else EVEN[min(len(packets), EVEN_ARRIVALS)]
         self.tells = tolerance > 0.0
-        self.even = in_order and span_s > NO_TIME_S and off <= tolerance * nbytes * span_s
+        self.even = self.tells and in_order and span_s > NO_TIME_S and off <= tolerance * nbytes * span_s
         if self.even:
             self.even_rate = max(self.even_rate, rate)
         last_s, first_s = packet.sent_s, first.sent_s

@@ -87,9 +87,11 @@ class TwoLanes:
 
 def test_data_moves_to_the_datagram_lane_once_it_answers() -> None:
     lanes = TwoLanes(stream=models()[0], datagrams=models()[1])
-    lanes.run(0.9)
+    lanes.run(1.1)  # it is opened after a second
     assert lanes.core.link.lane.id == LANE_ZMQ
-    lanes.run(9.1)
+    lanes.run(0.3)
+    assert lanes.core.link.lane.id == LANE_UDP
+    lanes.run(8.6)
     assert lanes.core.link.lane.id == LANE_UDP
     assert lanes.hop.forward.stats.goodput_bps > 0.8 * RATE_BPS * 0.85
     lanes.check_log()
@@ -134,6 +136,18 @@ def test_much_over_a_short_clean_path_takes_the_stream_in_large_pieces() -> None
     assert lanes.core.link.lanes.by_id[LANE_UDP].usable, "datagrams would get through"
     assert max(lanes.sizes) > 2 * DATAGRAM_BYTES
     lanes.check()
+
+
+def test_the_stream_goes_on_from_what_datagrams_have_found() -> None:
+    """Its own window is that of the session's begin."""
+    lanes = ShortPath()
+    windows: dict[int, float] = {}
+    while lanes.used != [LANE_ZMQ, LANE_UDP, LANE_ZMQ]:
+        lanes.run(0.01)
+        windows[lanes.core.link.lane.id] = lanes.core.link.lane.estimator.window_bytes
+    assert windows[LANE_ZMQ] >= 0.9 * windows[LANE_UDP] > 0.0
+    rate_bps = lanes.core.link.lane.estimator.rate_bps
+    assert rate_bps is not None and rate_bps > 0.8 * 8e6
 
 
 def test_data_is_back_with_the_datagrams_when_the_path_gets_thin() -> None:

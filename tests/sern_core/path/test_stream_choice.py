@@ -116,6 +116,12 @@ def test_less_than_datagrams_carried_is_a_failure_only_where_something_waits() -
     assert scene.run(3.0, 60e6)
 
 
+def test_a_stream_whose_window_lets_little_through_is_not_idle() -> None:
+    scene = streaming()
+    assert not scene.run(1.2, 5e6, held=True)
+    assert not scene.run(REST_S - 2.0, 60e6), "it is not tried again at once"
+
+
 def test_what_is_late_in_flight_gives_the_stream_up_at_once_and_each_time_for_longer() -> None:
     scene = streaming()
     rests_s: list[float] = []

@@ -85,6 +85,48 @@ def test_a_larger_packet_takes_longer_and_is_no_queue_for_it() -> None:
     assert path.model.delay.empty_s - base_s == pytest.approx(FRAGMENT_BYTES / rate)
 
 
+@pytest.mark.parametrize("jitter", [True, False])
+def test_much_larger_packets_that_jitter_holds_longer_are_no_queue(jitter: bool) -> None:
+    path = Path().settled()
+    model = path.model
+    if jitter:
+        model.view.learn()
+        model.view.jitter_s = 0.002
+    model.larger_packet(2 * FRAGMENT_BYTES)
+    path.epoch()  # of small ones too
+    seen = path.epoch(0.003)
+    assert seen.queue_s == pytest.approx(0.0 if jitter else 0.003, abs=1e-4)
+    assert path.epoch(0.009).queue_s == pytest.approx(seen.queue_s + 0.006, abs=1e-4), "what grows since is one"
+
+
+def test_what_jitter_holds_is_no_more_than_it_can() -> None:
+    path = Path().settled()
+    path.model.view.learn()
+    path.model.view.jitter_s = 0.002
+    path.model.larger_packet(2 * FRAGMENT_BYTES)
+    path.epoch()
+    most_s = DEFAULT_HYBRID.segmented_spreads * path.model.view.jitter_s
+    assert path.epoch(0.5).queue_s == pytest.approx(0.5 - most_s, abs=1e-3)
+
+
+def test_packets_that_follow_each_other_closely_take_no_longer_than_that() -> None:
+    """A window of few packets shows a small rate, by which each would take long, and hide the jitter."""
+    path = Path(rate=100e3).settled()
+    assert not path.model.view.jittery
+    packet_s = FRAGMENT_BYTES / 1e6
+    for _ in range(20):
+        model, now = path.model, path.now
+        model.begin_epoch(now)
+        for number in range(8):  # four at once now and again, two of which are held by half of a packet's time
+            path.now = now + 0.05 * (number // 4) + packet_s * (number % 4)
+            sample = path.packet(0.006 * (number % 2))
+            path.now -= FRAGMENT_BYTES / path.rate
+            model.note(sample)
+        path.now = now + 0.1
+        model.close_epoch(path.now, DEFAULT_HYBRID.base_window_s, path.window, steered=True)
+    assert path.model.view.jittery
+
+
 def test_a_restart_keeps_length_and_rate() -> None:
     path = Path().settled()
     rate, rtt_s = path.model.rate.value, path.model.rtt_s

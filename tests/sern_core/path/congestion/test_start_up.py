@@ -5,6 +5,8 @@ from math import inf
 import pytest
 
 from sern_core.path.capacity import AckSample
+from sern_core.path.congestion.params import DEFAULT_HYBRID
+from sern_core.path.congestion.start_up import StartUp
 from sern_core.path.congestion.train import TRAIN_BYTES, Train
 from sern_core.vocabulary.types import PriorityClass
 from sern_sim.models import Jitter, LinkModel
@@ -22,7 +24,7 @@ class Sent:
         self.train = Train()
         self.at_s, self.sent_s, self.cum_bytes = 1.0, 0.5, 0
 
-    def arrive(self, gaps_s: list[float], *, left_gap_s: float = 0.0) -> bool:
+    def arrive(self, gaps_s: list[float], *, left_gap_s: float = 0.0, jittery: bool = False) -> bool:
         """Whether the last of them tells a rate."""
         told = False
         for gap_s in gaps_s:
@@ -42,6 +44,7 @@ class Sent:
                 ),
                 self.sent_s,
                 RTT_S,
+                jittery=jittery,
             )
         return told
 
@@ -64,6 +67,38 @@ def test_an_uneven_train_shows_that_it_is_none() -> None:
     assert sent.arrive([0.004, 0.003, 0.001, *[1e-6] * (PACKETS - 3)])
     assert not sent.train.even and sent.train.even_rate == 0.0
     assert 0.0 < sent.train.whole_rate < inf
+
+
+def test_few_acknowledgements_are_even_by_chance() -> None:
+    """A stream's large fragments are acknowledged a few at a time."""
+    sent = Sent()
+    sent.arrive([0.001])
+    for _ in range(2):
+        sent.cum_bytes += TRAIN_BYTES
+        assert sent.arrive([0.001]) and not sent.train.even and not sent.train.tells
+    sent.cum_bytes += TRAIN_BYTES
+    assert sent.arrive([0.001]) and sent.train.even and sent.train.tells
+
+
+def test_where_packets_came_unevenly_it_takes_more_of_them() -> None:
+    sent = Sent()
+    for count in range(1, 2 * PACKETS):
+        sent.arrive([0.001], jittery=True)
+        assert sent.train.even == (count >= PACKETS)
+
+
+def test_a_window_that_comes_as_it_left_within_a_round_trip_or_two_shows_no_bottleneck() -> None:
+    """The first half of the window waited in TCP for the second one, so it came as evenly as behind a slow link."""
+    start = StartUp(DEFAULT_HYBRID)
+    start.begin(0.0, 12_600.0, None)
+    ramps = []
+    for number in range(1, 11):
+        at_s = 1.0 + 0.001 * number
+        sample = AckSample(at_s, 0.008, 1260, 0, at_s, 1260 * number, False, at_s - 0.008)
+        ramps.append(start.ramp(sample, at_s - 0.008, window=12_600.0, rtt_s=0.008, fragment=1260.0))
+    assert ramps[:-1] == [None] * 9
+    last = ramps[-1]
+    assert last is not None and last.round_over and not last.filled and last.window > 12_600.0
 
 
 def test_what_comes_at_once_is_no_rate() -> None:
