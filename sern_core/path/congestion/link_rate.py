@@ -8,6 +8,7 @@ from sern_core.path.congestion.parts import GreatestRate, LatelyArrived
 
 BURST_BYTES: Final = 4 * 1200
 """What comes in a shorter burst tells too little."""
+SPAN_PACKETS: Final = 4
 BURST_TIMES: Final = 1.03
 BURSTS: Final = 3
 """This many bursts in a row, each `BURST_TIMES` as fast as the link was known to be, show that it is faster."""
@@ -178,14 +179,15 @@ class Slowdown:
         """The queue went, or who keeps it is somebody else."""
         self._full = None
 
-    def arrives(self, receiver_s: float, cum_bytes: int) -> float | None:
-        """The bytes/s that arrived over a span with a queue throughout: the link was never idle. None: it goes on."""
+    def arrives(self, receiver_s: float, cum_bytes: int, packet_s: float = 0.0) -> float | None:
+        """The bytes/s that arrived over a span with a queue throughout: the link was never idle. None: it goes on.
+        `packet_s`: what a packet takes; one or two of them, and they may be small, show no rate."""
         full = self._full
         if full is None:
             self._full = (receiver_s, cum_bytes)
             return None
         span_s = receiver_s - full[0]
-        if span_s < self._params.min_rate_span_s:
+        if span_s < max(self._params.min_rate_span_s, SPAN_PACKETS * packet_s):
             return None
         self._full = (receiver_s, cum_bytes)
         return (cum_bytes - full[1]) / span_s

@@ -112,8 +112,8 @@ class PathModel:
             queued = not sample.app_limited or queue_s > self.fragment / carried
             self.eased.note(sample.now, receiver_s - sent_s, nbytes or self.fragment, carried, queued=queued)
         last, self._last = self._last, (receiver_s, sample.cum_bytes)
-        if last is not None and sample.cum_bytes > last[1] and receiver_s >= last[0]:
-            self._gaps.append((receiver_s - last[0]) / (sample.cum_bytes - last[1]))
+        if last is not None and (came_bytes := sample.cum_bytes - last[1]) > 0:
+            self._gaps.append(max(0.0, receiver_s - last[0]) / came_bytes)
         if not sample.app_limited:
             self._limited += 1
         rate.arrived.note(receiver_s, sample.cum_bytes)
@@ -129,7 +129,7 @@ class PathModel:
     def slower_rate(self, sample: AckSample) -> float | None:
         """What arrives while a queue stays, in bytes/s, where it is clearly less than what is known: the link is never
         idle then, and this is all it can do, whatever was seen before."""
-        rate = self.slowdown.arrives(sample.receiver_s, sample.cum_bytes)
+        rate = self.slowdown.arrives(sample.receiver_s, sample.cum_bytes, self.view.serialise_s)
         known = self.rate.value
         if rate is not None and known is not None and 0.0 < rate < self._params.slower * known:
             return rate

@@ -1,5 +1,7 @@
 """What a link carries is known from bursts, too, where it is idle in between: a cloud now and again."""
 
+from statistics import median
+
 import pytest
 
 from sern_core.path.congestion.link_rate import BURST_BYTES, BURSTS, LinkRate
@@ -65,21 +67,27 @@ def test_clouds_over_a_link_that_carries_three_times_as_much_come_as_soon_as_it_
 ) -> None:
     """They come together, so that the last of them waits for all others: a pace below the capacity shows most there."""
     capacity_bps = 3 * 8 * robots * nbytes * rate_hz
-    world = World(lossless=False)
+    takes_s = 8 * robots * nbytes / capacity_bps
+    late_s = [_late_s(robots, nbytes, rate_hz, capacity_bps, seed) for seed in range(1, 4)]
+    assert median(late_s) < 1.25 * (takes_s + DELAY_S + JITTER_S)
+
+
+def _late_s(robots: int, nbytes: int, rate_hz: float, capacity_bps: float, seed: int) -> float:
+    """How old nine of ten clouds are at most, of those that come from 5 to 9 s; most of them must."""
+    world = World(lossless=False, seed=seed)
     robot = world.client(
         "robot", LinkModel(rate_bps=capacity_bps, delay_s=DELAY_S, jitter_s=JITTER_S, overhead_bytes=28)
     )
     site = world.client("site", patterns=["/robot/.*"])
     for number in range(robots):
         robot.every(1 / rate_hz, robot.publish(f"/robot/points{number}", spec(PriorityClass.STATE)), bytes(nbytes))
-    world.run(15.0)
+    world.run(9.0)
     ages_s = sorted(
         got.at_s - robot.sent[f"/robot/points{number}", got.seq][0]
         for number in range(robots)
         for got in site.on(f"/robot/points{number}")
         if got.at_s - world.network.start_s > 5.0
     )
-    assert len(ages_s) >= 0.98 * robots * rate_hz * 10
-    takes_s = 8 * robots * nbytes / capacity_bps
-    assert ages_s[int(0.9 * len(ages_s))] < 1.25 * (takes_s + DELAY_S + JITTER_S)
+    assert len(ages_s) >= 0.98 * robots * rate_hz * 4
     world.validate()
+    return ages_s[int(0.9 * len(ages_s))]

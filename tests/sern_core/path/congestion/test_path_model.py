@@ -2,6 +2,7 @@
 
 import pytest
 
+from sern_core.path.congestion.link_rate import SPAN_PACKETS, Slowdown
 from sern_core.path.congestion.params import DEFAULT_HYBRID
 from tests.sern_core.path.congestion.acknowledged import FRAGMENT_BYTES, RTT_S, Path
 
@@ -49,6 +50,13 @@ def test_a_queue_that_stays_shows_a_slower_link() -> None:
     assert path.model.replace_rate(path.now, found[0]), "that is clearly less"
     assert path.model.rate.value == found[0]
     assert not path.model.replace_rate(path.now, 0.9 * found[0])
+
+
+def test_a_packet_or_two_of_a_thin_link_show_no_rate() -> None:
+    slowdown, packet_s = Slowdown(DEFAULT_HYBRID), 0.15
+    assert slowdown.arrives(1.0, 0, packet_s) is None
+    assert slowdown.arrives(1.2, 208, packet_s) is None, "a small one"
+    assert slowdown.arrives(1.0 + SPAN_PACKETS * packet_s, 4800, packet_s) == pytest.approx(8000.0)
 
 
 def test_when_the_queue_of_a_slower_link_has_gone_its_rate_is_all_that_it_can_do() -> None:
