@@ -61,7 +61,7 @@ class Composer:
         """
         sender, scheduler = self._sender, self._sender.scheduler
         control = self._control
-        limit = lane.fragment_bytes - (framing.ACK.size if lane.arrivals.unacked else 0)
+        limit = lane.fragment_bytes - framing.ACK.size * min(lane.arrivals.acks, framing.MAX_ACK_FRAMES)
         control_only = lane is self._lanes.priority_lane
         window_open = lane.open_at(now)
         pends = scheduler.pends

@@ -85,13 +85,9 @@ class DataPlane:
         arrivals = lane.arrivals
         if arrivals.unacked and not end.half_read and (datagram.items or arrivals.due or now >= arrivals.deadline_s()):
             # In front: the receiver's clock estimate has the newest sample before it judges the age of what follows.
-            datagram.frames.insert(
-                0,
-                framing.encode_ack(
-                    lane.id, arrivals.highest, arrivals.mask, arrivals.echo_us, arrivals.received_us, arrivals.cum_bytes
-                ),
-            )
-            arrivals.flushed(now)
+            acks = arrivals.take(framing.MAX_ACK_FRAMES, now)
+            datagram.frames[:0] = [framing.encode_ack(lane.id, *ack) for ack in acks]
+            end.dirty = end.dirty or arrivals.due
         if not datagram.frames:
             return None
         if not datagram.items:

@@ -12,9 +12,10 @@ at most once in `ACK_SPACING_S`, small ones between relays every `SPARSE_ACK_DAT
 control, else within `ACK_DELAY_S`.
 """
 
+from collections import deque
 from collections.abc import Callable
 from math import inf
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from sern_core.path.clocksync import RttEstimator
 from sern_core.vocabulary.types import CLASSES, PriorityClass
@@ -42,6 +43,8 @@ SPACED_BYTES: Final = 16 * 1024
 """Smaller datagrams are those of a slow link, or of one whose rate its sender is about to find out."""
 SACK_BITS: Final = 64
 SACK_MASK: Final = (1 << SACK_BITS) - 1
+MAX_WAITING_ACKS: Final = 32
+"""Acknowledgements that wait to be sent because one alone does not name all that came at once: 2,000 datagrams."""
 
 Items = list[Any]
 """What a packet carried, opaque here: handed back when the packet is acknowledged or lost."""
@@ -229,10 +232,24 @@ class Flight:
         check(not self.packets or self.waiting_since_s is not None, "nobody waits for what is in flight")
 
 
+class Ack(NamedTuple):
+    """What an acknowledgement says: the highest number, which of those before it have arrived, the send stamp of the
+    highest and when it arrived, and bytes by then."""
+
+    highest: int
+    mask: int
+    echo_us: int
+    received_us: int
+    cum_bytes: int
+
+
 class Arrivals:
     """The receiver's half: which numbers have arrived, and when to say so."""
 
     __slots__ = (
+        "_lossless",
+        "_told",
+        "_waiting",
         "cum_bytes",
         "due",
         "echo_us",
@@ -252,6 +269,9 @@ class Arrivals:
         self.every = SPARSE_ACK_DATAGRAMS if sparse else 2
         self.highest = 0
         self.mask = 0  # bit i: highest-1-i has arrived
+        self._lossless = lossless
+        self._told = 0  # the highest number that an acknowledgement was made for
+        self._waiting: deque[Ack] = deque(maxlen=MAX_WAITING_ACKS)
         self.echo_us = 0
         self.received_us = 0
         self.cum_bytes = 0
@@ -264,6 +284,11 @@ class Arrivals:
     def arrived(self, number: int, stamp_us: int, nbytes: int, *, now: float) -> bool:
         """Note one numbered datagram. False: seen before, a duplicate made by the network."""
         ahead = number - self.highest
+        if self.unacked and number - self._told > SACK_BITS and not self._lossless and ahead > 0:
+            # With this one as the highest an acknowledgement would not name the first of those that wait for theirs,
+            # which would be sent again: a busy end reads more than it can name at once.
+            self._waiting.append(self._ack())
+            self._told = self.highest
         if ahead == 1:
             self.mask = (self.mask << 1 | (1 if self.highest else 0)) & SACK_MASK
         elif ahead > 0:
@@ -300,8 +325,29 @@ class Arrivals:
         delayed_s = self.since_s + ACK_DELAY_S
         return min(delayed_s, self.flushed_s + self.spacing_s) if self.spaced and not self.due else delayed_s
 
+    def _ack(self) -> Ack:
+        return Ack(self.highest, self.mask, self.echo_us, self.received_us, self.cum_bytes)
+
+    @property
+    def acks(self) -> int:
+        """How many acknowledgements it takes to name what has arrived."""
+        return len(self._waiting) + (self.unacked > 0)
+
+    def take(self, most: int, now: float) -> list[Ack]:
+        """The next acknowledgements, oldest first, `most` at once. They are sent now; `due` stays while there are
+        more."""
+        waiting = self._waiting
+        if len(waiting) < most:
+            found = [*waiting, self._ack()]
+            self.flushed(now)
+            return found
+        self.due = True
+        return [waiting.popleft() for _ in range(most)]
+
     def flushed(self, now: float) -> None:
-        """They are acknowledged now."""
+        """All are acknowledged now."""
+        self._waiting.clear()
+        self._told = self.highest
         self.unacked = 0
         self.due = self.spaced = False
         self.flushed_s = now

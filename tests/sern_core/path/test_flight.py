@@ -1,5 +1,8 @@
 """What is in flight, what has arrived, and when either is given up or acknowledged."""
 
+from collections.abc import Iterable
+from random import Random
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -8,10 +11,12 @@ from sern_core.path.flight import (
     ACK_DELAY_S,
     ACK_SPACING_S,
     FIRST_LOSS_TIMEOUT_S,
+    MAX_WAITING_ACKS,
     REORDER_MEMORY_S,
     SACK_BITS,
     SPACED_BYTES,
     SPARSE_ACK_DATAGRAMS,
+    Ack,
     Arrivals,
     Flight,
 )
@@ -211,6 +216,48 @@ def test_no_acknowledgement_of_datagrams_that_may_be_lost_waits() -> None:
         assert arrivals.due is (number % 2 == 0)
         if arrivals.due:
             arrivals.flushed(0.0)
+
+
+def named(acks: Iterable[Ack]) -> set[int]:
+    """Numbers that they say have arrived."""
+    found = set()
+    for ack in acks:
+        found |= {ack.highest} | {ack.highest - 1 - bit for bit in range(SACK_BITS) if ack.mask >> bit & 1}
+    return found
+
+
+@settings(max_examples=cases(60))
+@given(st.integers(1, 400), st.integers(0, 2**16))
+def test_what_comes_faster_than_it_is_acknowledged_is_named_all_the_same(count: int, seed: int) -> None:
+    """A busy end reads hundreds of datagrams before it can send anything: one acknowledgement names 65."""
+    chance, arrivals, sender = Random(seed), Arrivals(), flight(2 * count)
+    numbers = [number for number in range(1, 2 * count + 1) if chance.random() < 0.5]
+    for number in numbers:
+        arrivals.arrived(number, number, 100, now=0.01)
+    most, rounds = 4, 0
+    while arrivals.acks:
+        acks = arrivals.take(most, 0.02)
+        assert 0 < len(acks) <= most and arrivals.due is (arrivals.acks > 0)
+        for ack in acks:
+            numbers = [number for number in numbers if number not in named([ack])]
+            sender.acked(ack.highest, ack.mask, now=0.03)
+        rounds += 1
+    assert numbers == [] and rounds <= count // (most * SACK_BITS // 2) + 1
+    valid(sender)
+
+
+def test_an_end_that_never_gets_to_acknowledge_keeps_a_bounded_number() -> None:
+    arrivals = Arrivals()
+    for number in range(1, 100 * SACK_BITS * MAX_WAITING_ACKS, SACK_BITS):
+        arrivals.arrived(number, 0, 100, now=0.0)
+    assert arrivals.acks == MAX_WAITING_ACKS + 1
+
+
+def test_a_stream_needs_one_acknowledgement_for_all() -> None:
+    arrivals = Arrivals(lossless=True)
+    for number in range(1, 10 * SACK_BITS):
+        arrivals.arrived(number, 0, 100, now=0.0)
+    assert arrivals.acks == 1
 
 
 def test_a_far_jump_of_numbers_costs_nothing() -> None:
