@@ -17,6 +17,9 @@ from sern_core.vocabulary.types import DropReason
 FIRST_MESSAGES_S: Final = 1.0
 """How long subscribers are waited for, from the publisher's beginning or when the graph is learned. To connect takes
 some 10 ms; a subscriber that is known and does not come is a node that crashed."""
+MAX_FIRST_MESSAGES: Final = 10_000
+"""How many are kept of a reliable publisher, at most: more than 2 kHz has before all subscribers are known. At 1 kHz a
+hundred were too few by some, now and again (measured). Bytes are bounded as well."""
 SETTLE_S: Final = 0.1
 """How long it may take the subscriber to see that we are connected, once we do. There is no sign of that here."""
 LEARN_S: Final = 4.0

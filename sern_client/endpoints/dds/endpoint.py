@@ -25,7 +25,7 @@ from sern_client.endpoints.base import (
     Sink,
     TopicEvents,
 )
-from sern_client.endpoints.common.first_messages import LEARN_S, FirstMessages
+from sern_client.endpoints.common.first_messages import LEARN_S, MAX_FIRST_MESSAGES, FirstMessages
 from sern_client.endpoints.common.interest import Subscriptions
 from sern_client.endpoints.common.saying import SayOnce
 from sern_client.endpoints.common.stream import Stream, Streams
@@ -150,7 +150,7 @@ class DdsEndpoint:
             readers=lambda: writer.readers(self._waiting_readers(topic, names.type_to_dds(resolved.name), offered)),
             write=writer.publish,
             dropped=self._streams.drop,
-            max_messages=info.depth or 1 if best_effort else max(depth, self.options.queue_depth),
+            max_messages=info.depth or 1 if best_effort else max(depth, MAX_FIRST_MESSAGES),
             max_bytes=self.options.max_buffer_bytes,
             overflow=DropReason.SUPERSEDED if best_effort else DropReason.QUEUE_FULL,
             learning_s=self._started_s + LEARN_S - asyncio.get_running_loop().time(),

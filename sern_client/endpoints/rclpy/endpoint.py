@@ -3,7 +3,6 @@
 import asyncio
 import logging
 from collections import Counter
-from typing import Final
 
 from sern_client.endpoints.base import (
     Difference,
@@ -15,7 +14,7 @@ from sern_client.endpoints.base import (
     Sink,
     TopicEvents,
 )
-from sern_client.endpoints.common.first_messages import LEARN_S, FirstMessages
+from sern_client.endpoints.common.first_messages import LEARN_S, MAX_FIRST_MESSAGES, FirstMessages
 from sern_client.endpoints.common.interest import Subscriptions
 from sern_client.endpoints.common.saying import SayOnce
 from sern_client.endpoints.common.stream import Stream, Streams
@@ -33,9 +32,6 @@ from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.entry import end_tasks
-
-MAX_FIRST_MESSAGES: Final = 100
-"""Messages of one topic that may wait for its first subscribers."""
 
 _log = logging.getLogger(__name__)
 

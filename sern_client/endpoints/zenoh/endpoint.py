@@ -23,7 +23,7 @@ from sern_client.endpoints.base import (
     Sink,
     TopicEvents,
 )
-from sern_client.endpoints.common.first_messages import LEARN_S, FirstMessages
+from sern_client.endpoints.common.first_messages import LEARN_S, MAX_FIRST_MESSAGES, FirstMessages
 from sern_client.endpoints.common.interest import OnDemand, Subscriptions
 from sern_client.endpoints.common.saying import SayOnce
 from sern_client.endpoints.common.stream import Stream, Streams
@@ -46,8 +46,6 @@ ROUTER_WAIT_S: Final = 3.0
 LOOK_S: Final = 1.0
 """How often it is looked whether there is one."""
 MAX_COMPLAINTS: Final = 256
-MAX_FIRST_MESSAGES: Final = 100
-"""Messages of a reliable topic that may wait for its first subscribers."""
 
 _log = logging.getLogger(__name__)
 

@@ -1,6 +1,7 @@
 """What is published as soon as a stream begins reaches the subscribers that are known."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 
@@ -65,6 +66,26 @@ async def test_a_young_endpoint_waits_until_it_knows(
     patient(0.0)
     await peer.line("got b ", 4)
     assert all(same(one, other) for one, other in zip(peer.got("b"), BODIES, strict=True))
+    assert endpoint.drops == {}
+
+
+async def test_a_fast_topic_keeps_all_of_its_first_messages(
+    domain: int, make_peer: MakePeer, make_endpoint: MakeEndpoint, patient: Callable[[float], None]
+) -> None:
+    """More than the default depth of an endpoint's queue: 0.1 s and a little more of 1 kHz."""
+    peer = await make_peer(domain)
+    bodies = BODIES * 100
+    await peer.do(f"sub b rt/chat {STRING} reliable depth={len(bodies)}")
+    endpoint, _ = await make_endpoint(domain)
+    stream = endpoint.advertise(replace(CHAT, depth=10))
+    for body in bodies:
+        stream.publish(body, STAMP_NS)
+    assert endpoint.drops == {}
+    await peer.line("matched b 1")
+    patient(0.0)
+    await peer.line("got b ")
+    await peer.line("got b ", len(bodies) - 1)
+    assert all(same(one, other) for one, other in zip(peer.got("b"), bodies, strict=True))
     assert endpoint.drops == {}
 
 
