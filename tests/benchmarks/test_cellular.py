@@ -45,14 +45,14 @@ def test_the_link_carries_what_was_recorded() -> None:
 
 def test_what_is_sent_in_a_gap_waits_for_its_end() -> None:
     model, duration_s = recorded([4] * 150 + [0] * 50 + [4] * 300, None)
-    played = play_core(model, duration_s, bulk=False)
+    played = play_core(model, duration_s, offered=0.0)
     assert 250 < len(played.ages_s) < 300, "some of the gap were replaced by newer ones, of 6 s that count"
     assert played.ages_s[0] < 0.03 and played.ages_s[-1] > 0.9
 
 
 def test_bulk_fills_a_link_and_poses_alone_do_not() -> None:
     model, duration_s = recorded(EVEN, None)
-    alone, beside = (play_core(model, duration_s, bulk=bulk) for bulk in (False, True))
+    alone, beside = (play_core(model, duration_s, offered=offered) for offered in (0.0, 4.0))
     pose_share = 50 * 8 * (100 + 80 + OVERHEAD_BYTES) / model.rate_bps_at(1.0)  # type: ignore[operator]
     assert alone.used == pytest.approx(pose_share, rel=0.3) and alone.delivered == 0
     assert beside.used > 0.9 and 0.6 < beside.delivered < beside.used
