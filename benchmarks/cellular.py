@@ -176,7 +176,8 @@ def bench(options: argparse.Namespace, report: Report) -> None:
     for of, shares in used.items():
         report.reach(f"{of}: share of the link that bulk uses", sum(shares) / len(shares), LIMITS[of], at_least=True)
         report.reach(f"{of}: p95 of poses, times that of poses alone", sum(older[of]) / len(older[of]), AGE_LIMIT)
-    report.note(f"virtual time; steps of {STEP_SLOTS * SLOT_S:g} s, {1e3 * DELAY_S:g} ms each way; sern: medians of {len(OFFERED)} loads")
+    path_note = f"steps of {STEP_SLOTS * SLOT_S:g} s, {1e3 * DELAY_S:g} ms each way"
+    report.note(f"virtual time; {path_note}; sern: medians of {len(OFFERED)} loads")
     if seconds is not None:
         report.note(f"the first {seconds:g} s of each")
 
