@@ -18,12 +18,11 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from statistics import median
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from benchmarks.common import Report, main, percentile
+from benchmarks.common import Report, main, medians, percentile
 from benchmarks.flows import DATAGRAM_BYTES, HEADER_BYTES, OVERHEAD_BYTES, POSE_BYTES, BbrLike, Cubic
 from benchmarks.flows import World as Flows
 from benchmarks.recorded_links import CELLULAR, DELAY_S, SLOT_PACKET_BYTES, SLOT_S, STEP_SLOTS, read, recorded
@@ -93,12 +92,6 @@ def play_core(model: LinkModel, duration_s: float, *, offered: float, queue_s: f
     return Played(stats.utilisation, 8 * clouds_bytes / stats.capacity_bits, sorted(ages_s))
 
 
-def middle(runs: Sequence[Played]) -> dict[str, float]:
-    """A row of medians."""
-    rows = [run.row() for run in runs]
-    return {name: median(row[name] for row in rows) for name in rows[0]}
-
-
 def play_window(model: LinkModel, duration_s: float, make: Callable[[], CapacityEstimator]) -> Played:
     """A window alone over the link."""
     flows = Flows(model, BACK)
@@ -157,11 +150,11 @@ def bench(options: argparse.Namespace, report: Report) -> None:
         model, duration_s = recorded(slots, seconds)
         play = partial(play_core, model, duration_s)
         alone = play(offered=0.0).row()
-        sern = middle([play(offered=offered) for offered in OFFERED])
+        sern = medians([play(offered=offered).row() for offered in OFFERED])
         rows = {
             "poses alone": alone,
             "sern": sern,
-            "sern, not following": middle([play(offered=offered, queue_s=None) for offered in OFFERED]),
+            "sern, not following": medians([play(offered=offered, queue_s=None).row() for offered in OFFERED]),
             "hybrid": play_window(model, duration_s, HybridWindow).row(),
             "bbr-like": play_window(model, duration_s, BbrLike).row(),
             "cubic": play_window(model, duration_s, Cubic).row(),

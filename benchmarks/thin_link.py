@@ -7,11 +7,10 @@ of this machine is in it, so a commit has one result.
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
-from statistics import median
+from collections.abc import Sequence
 from typing import Final
 
-from benchmarks.common import Report, main, percentile
+from benchmarks.common import Report, main, medians, percentile
 from benchmarks.link.figures import NEVER_S
 from tests.thin_link import (
     CLOUD,
@@ -50,12 +49,6 @@ def ages(found_s: Sequence[float], rate_hz: float) -> dict[str, float]:
             "age_most_s": found_s[-1],
         }
     return row
-
-
-def medians(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Of each column, over the rows that have it."""
-    names = dict.fromkeys(name for row in rows for name in row)
-    return {name: median(row[name] for row in rows if name in row) for name in names}
 
 
 def bench(options: argparse.Namespace, report: Report) -> None:
