@@ -71,7 +71,7 @@ class HybridParams:
     startup_aim: float = 0.9
     startup_share: float = 0.75
     """A round ends when this share of its window has been acknowledged."""
-    startup_longer: float = 0.25
+    startup_longer: float = 0.4
     """A window is full if packets took longer by this share of what they took in the quickest round..."""
     startup_far: float = 2.0
     """... and far more than full if they took so many times as long."""
