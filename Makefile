@@ -31,7 +31,7 @@ help:
 	@echo "make performance   as root: measure link, fleet and policies of docs/performance.md anew, two hours of an idle machine"
 	@echo "make endpoints, make figures   the other tables: ROS endpoints, 20 minutes; virtual time, summaries and codecs, 30"
 	@echo "make operations   the tables of keys and of durable topics, 10 minutes"
-	@echo "make cellular RECORDINGS=DIR   the table of recorded cellular links, a minute; virtual time"
+	@echo "make cellular RECORDINGS=DIR   the table of recorded cellular links, three minutes; virtual time"
 	@echo "make navigation   the tables of navigation and perception, hours; DRIVES=FILE keeps the drives, and goes on with them"
 	@echo "make paper    as root: the tables, figures and claims of the paper, in paper-out, hours; it goes on where it was interrupted"
 	@echo "make paper-quick   the same from few runs of each, a quarter of an hour"
