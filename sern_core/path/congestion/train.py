@@ -11,12 +11,13 @@ from sern_core.path.capacity import AckSample
 TRAIN_BYTES: Final = 8 * 1200
 TRAIN_SPREAD: Final = 1.1
 """A train was spread by the path if it takes so many times as long to arrive as it took to leave."""
-EVEN: Final = (0.0, 0.0, 0.0, 0.0, 0.05, 0.10, 0.16)
+EVEN: Final[tuple[float, ...]] = (0.0, 0.0, 0.0, 0.0, 0.05, 0.10, 0.16)
 """Packets come evenly if the share of them that has come is nowhere off by more from the share of the time. Behind a
 bottleneck they do. Where jitter alone spreads them they come in clumps, since who is held up holds up those behind:
 nine packets are off by .2 at least, 99 times of 100. Fewer acknowledgements, by whose number this is, are even by
 chance, and two always."""
-EVEN_ARRIVALS: Final = len(EVEN) - 1
+EVEN_ARRIVALS: Final = 6
+"""From so many on it is the last of these."""
 UNEVEN_ARRIVALS: Final = 9
 """So many where packets came unevenly before."""
 PAUSE_RTTS: Final = 0.25

@@ -7,7 +7,7 @@ import pytest
 from sern_core.path.capacity import AckSample
 from sern_core.path.congestion.params import DEFAULT_HYBRID
 from sern_core.path.congestion.start_up import StartUp
-from sern_core.path.congestion.train import TRAIN_BYTES, Train
+from sern_core.path.congestion.train import EVEN, EVEN_ARRIVALS, TRAIN_BYTES, Train
 from sern_core.vocabulary.types import PriorityClass
 from sern_sim.models import Jitter, LinkModel
 from tests.world import World, spec
@@ -71,6 +71,7 @@ def test_an_uneven_train_shows_that_it_is_none() -> None:
 
 def test_few_acknowledgements_are_even_by_chance() -> None:
     """A stream's large fragments are acknowledged a few at a time."""
+    assert len(EVEN) == EVEN_ARRIVALS + 1
     sent = Sent()
     sent.arrive([0.001])
     for _ in range(2):
