@@ -118,7 +118,7 @@ def clouds(case: Clouds, seed: int) -> Figures:
 
 
 def cases() -> dict[str, Callable[[int], Figures]]:
-    """By name, what plays one start."""
+    """Returns what plays one start, by the name of the case."""
     found: dict[str, Callable[[int], Figures]] = {}
     for rate_bps, jitter_s in ((8e6, 0.001), (4e6, 0.001), (8e6, 0.005), (8e6, 0.010), (8e6, 0.020)):
         path = f"{rate_bps / 1e6:g} Mbit/s ±{1e3 * jitter_s:g} ms"

@@ -9,6 +9,7 @@ from sern_core.path.congestion.parts import GreatestRate, LatelyArrived
 BURST_BYTES: Final = 4 * 1200
 """What comes in a shorter burst tells too little."""
 SPAN_PACKETS: Final = 4
+"""A slower link is told by what comes while it sends so many packets, at least."""
 BURST_TIMES: Final = 1.03
 BURSTS: Final = 3
 """This many bursts in a row, each `BURST_TIMES` as fast as the link was known to be, show that it is faster."""

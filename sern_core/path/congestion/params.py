@@ -58,7 +58,7 @@ class HybridParams:
     held_spreads: float = 1.5
     """At most so many spreads of the delay are taken for what jitter holds back: it may be a queue after all."""
     segmented_spreads: float = 3.0
-    """So many of packets of many segments, each of which jitter may hold."""
+    """The same bound for packets of many segments, each of which jitter may hold."""
     cut: float = 0.95
     idle_s: float = 2.0
     """What was not used for so long is halved, for the link may have changed; start-up brings it back."""

@@ -59,7 +59,7 @@ class PathModel:
         self.fragment = float(fragment_bytes)
         """Bytes of the largest packet that there is to send."""
         self._known_fragment = float(fragment_bytes)
-        """Of which size it is known how jitter holds it."""
+        """The size of packets for which it is known how jitter holds them."""
         self._grew = False
         self._before_s: float | None = None
         """The queue before packets grew, in the epoch after that; None: they did not."""
@@ -181,7 +181,7 @@ class PathModel:
         return Seen(view.queue_s, rtt_s, limited, early, quicker)
 
     def _held_longer_s(self, queue_s: float) -> float:
-        """By how much jitter holds the packets of an epoch longer than those before, because they are larger: a
+        """Seconds for which jitter holds the packets of an epoch longer than those before, as they are larger: a
         fragment of a stream comes with the last of its segments, each of which jitter may hold. A window does not
         change so much in an epoch that this were its queue."""
         before_s, self._before_s = self._before_s, None

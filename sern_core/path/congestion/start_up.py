@@ -10,6 +10,7 @@ from sern_core.path.congestion.train import TRAIN_BYTES, Train
 LOST: Final = 0.2
 """A path that loses more than this share in an epoch drops what it cannot keep."""
 CLOCKED_RTTS: Final = 2.0
+"""A window that its acknowledgements let go comes within so many round trips, unless a bottleneck holds it."""
 RTT_WEIGHT: Final = 0.1
 """Share of a packet in what the round knows of the round trip; more of the first ones, so that they are a mean."""
 

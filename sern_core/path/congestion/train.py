@@ -19,7 +19,7 @@ chance, and two always."""
 EVEN_ARRIVALS: Final = 6
 """From so many on it is the last of these."""
 UNEVEN_ARRIVALS: Final = 9
-"""So many where packets came unevenly before."""
+"""Where packets came unevenly before, it takes so many."""
 PAUSE_RTTS: Final = 0.25
 """A sender that has nothing to send for so many round trips pauses: what comes then is another train."""
 NO_TIME_S: Final = 1e-5
