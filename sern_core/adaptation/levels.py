@@ -151,6 +151,7 @@ class RawProbe:
                 source = item.source
                 self._under_way.append((item, source.counters.offered))
                 source.adapt(share=1.0, depth_max=source.depth)  # until the next interval
+                source.probe_from_seq = source.next_seq
                 item.set_level(SummaryLevel.RAW)
         for item, _ in self._under_way:
             self._due_s.pop(item.source, None)

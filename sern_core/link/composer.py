@@ -65,8 +65,10 @@ class Composer:
         control_only = lane is self._lanes.priority_lane
         window_open = lane.open_at(now)
         pends = scheduler.pends
-        if not window_open and pends:
-            self._outlook.full(now)
+        if not pends:
+            self._outlook.nothing_waits()
+        elif not window_open:
+            self._outlook.waits(now)
             if scheduler.pending(PriorityClass.STATE) or scheduler.pending(PriorityClass.BULK):
                 self.background.live_waits(now)
         # Behind a window that is shut class control alone may leave.

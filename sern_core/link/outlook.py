@@ -25,6 +25,8 @@ SURE: Final = 0.9
 TRY_S: Final = 0.25
 """A try lasts a round trip and so long, and again as long while the window grows so many times: the rate follows it."""
 GROWS: Final = 1.2
+FULL_S: Final = 0.25
+"""A link for which something has waited so long is full."""
 MIN_PAUSE_S, MAX_PAUSE_S = 0.5, 2.0
 """After the first try that was in vain, and after many: the pause doubles each time."""
 
@@ -33,6 +35,7 @@ class Outlook:
     """What one end of a hop knows of that, for all its channels."""
 
     __slots__ = (
+        "_full_since_s",
         "_judged_s",
         "_pause_s",
         "_tried",
@@ -52,6 +55,7 @@ class Outlook:
         self._judged_s = 0.0  # when it is judged again
         self._pause_s = MIN_PAUSE_S
         self._try_s = now  # no try before
+        self._full_since_s: float | None = None
 
     def sent(self, priority: PriorityClass, nbytes: int, now: float) -> None:
         """Bytes of a class went on the wire."""
@@ -63,9 +67,17 @@ class Outlook:
         if priority is PriorityClass.CONTROL:
             self._urgent_bytes[0] += nbytes
 
-    def full(self, now: float) -> None:
-        """The link is full: what it carries is seen without a try."""
-        self._try_s = max(self._try_s, now + MIN_PAUSE_S)
+    def waits(self, now: float) -> None:
+        """There is more to send than the link takes now. Where that lasts the link is full, and what it carries is seen
+        without a try; for a moment it is so behind every message of a few fragments."""
+        if self._full_since_s is None:
+            self._full_since_s = now
+        elif now >= self._full_since_s + FULL_S:
+            self._try_s = max(self._try_s, now + MIN_PAUSE_S)
+
+    def nothing_waits(self) -> None:
+        """All that there was to send has left."""
+        self._full_since_s = None
 
     def _fade(self, now: float) -> None:
         elapsed_s, self._urgent_at_s = max(0.0, now - self._urgent_at_s), now
@@ -96,8 +108,11 @@ class Outlook:
             self._tried, self._try_s, self._vain_bytes = None, now + self._pause_s, lane.estimator.window_bytes
             self._pause_s = min(2 * self._pause_s, MAX_PAUSE_S)
             return False
-        if now < self._try_s and out.seq != channel.probe_seq:
+        probe = channel.probe_from_seq is not None and out.seq >= channel.probe_from_seq
+        if now < self._try_s and not probe:
             return False
+        if probe:
+            channel.probe_from_seq = None
         self._tried, self._try_s = (channel.channel_id, out.seq), now + MIN_PAUSE_S
         self._judge_later(lane, now)
         return True

@@ -111,7 +111,7 @@ class Fit:
             del self._watched[next(iter(self._watched))]
         self._watched[seq] = nbytes
         if self._probing:
-            self._channel.probe_seq = seq
+            self._channel.probe_from_seq = seq
 
     def _dropped(self, seq: int, reason: DropReason) -> None:
         """The channel counts a message as dropped, whichever."""

@@ -40,7 +40,7 @@ class OutChannel:
         "counters",
         "drops",
         "offered",
-        "probe_seq",
+        "probe_from_seq",
         "ready",
         "reliable",
         "required",
@@ -80,8 +80,9 @@ class OutChannel:
         """Whether it was announced in the session."""
         self.offered = False
         """Whether the scheduler knows of a pending message."""
-        self.probe_seq = 0
-        """This message is begun to see whether the link carries it, whatever is known of the link."""
+        self.probe_from_seq: int | None = None
+        """The first message from this one on that the link is not known to carry in time is begun all the same, to
+        see; None: none is."""
         self.required: tuple[str, ...] = ()
         """Reliable subscribers behind the peer, as it told us."""
 

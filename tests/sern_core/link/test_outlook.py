@@ -6,7 +6,7 @@ from sern_core.vocabulary.types import DropReason, PriorityClass
 from sern_sim.models import LinkModel, RateStep
 from tests.world import World, spec
 
-POSE, CAMERA, CLOUD = "/robot/pose", "/robot/camera", "/robot/points"
+POSE, SCAN, CAMERA, CLOUD = "/robot/pose", "/robot/scan", "/robot/camera", "/robot/points"
 POSES_BPS = 25e3
 """What the poses take of the link, roughly."""
 
@@ -14,8 +14,10 @@ POSES_BPS = 25e3
 class Robot:
     """A robot with 12.5 poses a second, and large clouds of a second's lifespan, on a link of 25 ms each way."""
 
-    def __init__(self, rate_bps: float, cloud_bytes: int, *steps: RateStep, reliable: bool = False) -> None:
-        self.world = World(lossless=False)
+    def __init__(
+        self, rate_bps: float, cloud_bytes: int, *steps: RateStep, reliable: bool = False, lossless: bool = False
+    ) -> None:
+        self.world = World(lossless=lossless)
         link = LinkModel(rate_bps=rate_bps, delay_s=0.025, rate_steps=steps)
         self.robot = self.world.client("robot", link, LinkModel(delay_s=0.025))
         self.site = self.world.client("site", patterns=["/robot/.*"])
@@ -29,6 +31,10 @@ class Robot:
         self.robot.every(
             8 * 10_000 / rate_bps, self.robot.publish(CAMERA, spec(priority, lifespan_s=1.0)), bytes(10_000)
         )
+
+    def scans(self) -> None:
+        """Scans of two fragments, ten a second."""
+        self.robot.every(0.1, self.robot.publish(SCAN, spec(PriorityClass.STATE)), bytes(2_000))
 
     def carried_bps(self, seconds: float) -> float:
         """What goes over the link in the next seconds."""
@@ -82,6 +88,18 @@ def test_a_full_link_is_not_tried() -> None:
     assert robot.passed_over == before, "none waits behind one that is tried"
 
 
+def test_a_probe_is_begun_whatever_else_fills_the_link() -> None:
+    robot = Robot(2e6, 600_000)
+    robot.camera(PriorityClass.STATE, 4e6)
+    robot.world.run(10.0)
+    assert not robot.cloud.flying
+    robot.cloud.probe_from_seq = robot.cloud.next_seq
+    robot.world.run(1.0)
+    assert robot.cloud.probe_from_seq is None, "one was begun"
+    robot.world.run(2.0)
+    assert not robot.cloud.flying, "and no other one"
+
+
 def test_what_more_urgent_classes_leave_is_what_counts() -> None:
     """0.6 s of the whole link, and a link of which half is taken."""
     robot = Robot(1e6, 75_000)
@@ -108,6 +126,18 @@ def test_a_link_that_got_faster_is_found_out() -> None:
     assert robot.site.on(CLOUD) == []
     robot.world.run(6.0)
     assert robot.arrived(CLOUD, 4.0) >= 6
+
+
+@pytest.mark.parametrize("lossless", [False, True])
+def test_a_faster_link_is_found_beside_messages_of_a_few_fragments(*, lossless: bool) -> None:
+    """They wait for the pacer for a moment, and so does what comes behind them: that is no full link."""
+    robot = Robot(0.3e6, 100_000, RateStep(20.0, 40e6), lossless=lossless)
+    robot.scans()
+    robot.world.run(20.0)
+    before = len(robot.site.on(CLOUD))
+    robot.world.run(6.0)
+    assert len(robot.site.on(CLOUD)) > before
+    assert robot.arrived(CLOUD, 4.0) >= 30
 
 
 def test_a_link_that_faded_and_came_back_is_used_at_once() -> None:
