@@ -14,7 +14,7 @@ from sern_core.objects.registry import ObjectRegistry
 from sern_core.path.congestion.hybrid import HybridWindow
 from sern_core.path.flight import Flight
 from sern_core.relay.forwarding import Forwarding
-from sern_core.relay.hub import Hub
+from sern_core.relay.hub_link_handler import HubLinkHandler
 from sern_core.site.client import ClientCore
 from sern_core.stream.in_stream import InStream
 from sern_core.stream.out_channel import OutChannel
@@ -50,7 +50,7 @@ CLIENT_EVENTS = (
 )
 Place = tuple[type, str]
 HANDLERS: list[Place] = [
-    *((Hub, name) for name in CALLBACKS),
+    *((HubLinkHandler, name) for name in CALLBACKS),
     *((ClientCore, name) for name in CALLBACKS),
     *((SimHub, name) for name in HUB_EVENTS),
     *((SimClient, name) for name in CLIENT_EVENTS),

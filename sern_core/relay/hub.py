@@ -11,10 +11,9 @@ confirmed everything is dropped at once, and so is one whose name is revoked. On
 relay is dropped when nobody is left here who needs what is kept of it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Final
 
 from sern_core.link.definitions import DefinitionStore
 from sern_core.link.housekeeping import TIDY_S
@@ -32,15 +31,14 @@ from sern_core.relay.forwarding import Forwarding
 from sern_core.relay.holding import Holding
 from sern_core.relay.hub_checks import check_channels, check_streams, taken
 from sern_core.relay.hub_events import GuardedEvents, HubEvents, Relayed
+from sern_core.relay.hub_link_handler import HubLinkHandler
 from sern_core.relay.hub_matching import Matching
 from sern_core.relay.hub_port import HubPort
 from sern_core.relay.hub_subscriptions import Subscriptions
 from sern_core.relay.interest import RoutingLimits
 from sern_core.relay.local_streams import LocalStreams
 from sern_core.relay.moved import MovedClients
-from sern_core.relay.object_exchange import OBJECTS_TOPIC, ObjectExchange
-from sern_core.relay.offers_again import NOT_THERE, OffersAgain
-from sern_core.relay.peer_control import PeerControl
+from sern_core.relay.object_exchange import ObjectExchange
 from sern_core.relay.peer_rules import RulesExchange
 from sern_core.relay.peers import Peers, says_hello
 from sern_core.relay.presence import Presence
@@ -49,26 +47,13 @@ from sern_core.relay.revocations import Revocations
 from sern_core.relay.route_change import RouteChange
 from sern_core.relay.routing import RoutingTable
 from sern_core.relay.traces import Traces
-from sern_core.stream.in_stream import InStream
-from sern_core.stream.out_channel import OutChannel
-from sern_core.stream.out_message import OutMessage
-from sern_core.vocabulary.errors import RefusedError, WireError
-from sern_core.vocabulary.key_news import ClientKeys, RelayKeys
-from sern_core.vocabulary.message import Message
+from sern_core.vocabulary.errors import RefusedError
+from sern_core.vocabulary.key_news import RelayKeys
 from sern_core.vocabulary.names import is_peer, peer_name
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
 from sern_core.vocabulary.types import ClientName, DropReason
 from sern_core.wire import framing
-from sern_core.wire.announce import Announcement
 from sern_core.wire.numbering import Numbering
-
-STREAMS_PER_US: Final = 10
-"""Streams that are looked at in a microsecond."""
-LANE_US: Final = 300
-KEYS_US: Final = 100
-CONFIRMED_PER_US: Final = 8
-"""What a client is charged with, in microseconds: to open a datagram lane for it, to look at its keys, and how many
-subscribers are asked for their share of a confirmation in one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +152,6 @@ class Hub:
             home=self.peers.home,
             now=now,
         )
-        self.offers_again = OffersAgain(streams, self.peers.epoch)
         self.relayed = streams.by_id
         self.claims = Claims(
             clients,
@@ -200,21 +184,29 @@ class Hub:
         self.absent = AbsentClients(clients, streams, self.routing, self.events, known, link.limits)
         streams.moves.asked = self.absent.asked
         streams.moves.deserted = self.peers.deserted
-        self.from_peers = PeerControl(
+        self.moved = MovedClients(clients, self.routing, streams, self.local_owners)
+        self.subscriptions = Subscriptions(
+            clients, self.events, self.presence, self.matching, self.routing, streams, self.exchange, self.absent
+        )
+        self.link_handler = HubLinkHandler(
             clients,
+            self.routing,
             streams,
+            self.objects,
             self.events,
+            forwarding=self.forwarding,
+            exchange=self.exchange,
+            subscriptions=self.subscriptions,
+            presence=self.presence,
+            holding=self.holding,
+            absent=self.absent,
+            moved=self.moved,
             peers=self.peers,
             claims=self.claims,
             feeds=self.feeds,
             rules=self.rules,
             revocations=self.revocations,
-            presence=self.presence,
             max_claims=params.routing.max_all_streams,
-        )
-        self.moved = MovedClients(clients, self.routing, streams, self.local_owners)
-        self.subscriptions = Subscriptions(
-            clients, self.events, self.presence, self.matching, self.routing, streams, self.exchange, self.absent
         )
 
     # --- how the parts hang together ------------------------------------------------------------------------------
@@ -227,7 +219,7 @@ class Hub:
             peer=client,
             initiator=is_peer(client) and says_hello(own, client),
             towards_relay=is_peer(client),
-            handler=self,
+            handler=self.link_handler,
             definitions=self.definitions,
             link=self._link_params,
             scheduler=self._scheduler_params,
@@ -461,179 +453,6 @@ class Hub:
         if LANE_PRIORITY not in link.lanes.by_id:
             link.open_lane(now=now, lane_id=LANE_PRIORITY)
         return True
-
-    # --- LinkHandler ----------------------------------------------------------------------------------------------
-
-    def on_fault(self, link: Link, error: Exception, *, now: float) -> None:
-        self.events.fault(link.peer, error)
-
-    def on_up(self, link: Link, *, resumed: bool, now: float) -> None:
-        self.clients.came(link.peer)
-        if is_peer(link.peer):
-            self.rules.up(link, now=now)  # before anything is announced
-            self.streams.moves.up(link.peer)
-            self.peers.up(link, now=now)
-            self.claims.up(link, now=now)
-            self.revocations.up(link, now=now)
-            self.exchange.came(link, resumed=resumed, now=now)
-            if not resumed:
-                self.streams.prime(link, now)
-            self.presence.relay_changed(link.peer, now=now)
-            self.events.peer_up(link.peer)
-            return
-        before = self.peers.home(link.peer)
-        self.peers.came(link.peer, now=now)
-        self.streams.moves.came_home(link.peer, now)
-        self.offers_again.came(self.routing.streams_of(link.peer), now=now)
-        if before is not None:
-            self.events.went_over(link.peer, before, came=True)
-        self.moved.discard(link.peer)
-        if link.end.peer_boot is not None:
-            self.routing.returned(link.peer, link.end.peer_boot)
-        self.subscriptions.forget(link.peer)  # half of one that was said in an earlier session
-        if not resumed:
-            self.streams.prime(link, now)
-        self.exchange.came(link, resumed=resumed, now=now)
-        self.presence.changed(link.peer, now=now)
-        self.events.client_up(link.peer, resumed=resumed)
-
-    def on_down(self, link: Link, reason: str, *, now: float) -> None:
-        self.clients.went(link.peer, now)
-        if is_peer(link.peer):
-            self.presence.relay_changed(link.peer, now=now)
-            self.events.peer_down(link.peer, reason)
-            return
-        self.presence.changed(link.peer, now=now)
-        self.holding.went(link.peer)
-        self.events.client_down(link.peer, reason)
-
-    def on_lane_closed(self, link: Link) -> None:
-        self.events.lane_closed(link.peer)
-
-    def on_rejected(self, link: Link, code: str, text: str, *, now: float) -> None:
-        """Another relay does not take us: it says why."""
-        self.events.refused(link.peer, code, text)
-
-    def on_announce(self, link: Link, announcement: Announcement, *, now: float) -> bool | None:
-        stream = link.taking.streams[announcement.stream.id]
-        identity = stream.stream.id
-        if is_peer(link.peer) and identity.topic != OBJECTS_TOPIC:
-            if self.peers.home(identity.origin) != link.peer:
-                raise RefusedError(
-                    "origin", f"{link.peer[1:]} announced a stream of {identity.origin}, who is not there"
-                )
-        # What is kept on disk has the number of its store, which is the origin's to draw.
-        elif identity.origin != link.peer or (identity.boot != link.end.peer_boot and not stream.stream.spec.durable):
-            raise RefusedError("origin", f"{link.peer} announced a stream of {identity.origin}")
-        if identity.topic == OBJECTS_TOPIC:
-            return True
-        on_disk = self.holding.position(identity)
-        if on_disk > stream.delivered:  # an earlier run of ours has it, and its origin may not know yet
-            stream.delivered = stream.confirmed = on_disk
-        try:
-            relayed = self.streams.take(link, stream, now)
-        except RefusedError as refusal:
-            self.events.refused(link.peer, refusal.code, str(refusal))
-            if refusal.code == "name_taken" and is_peer(link.peer):
-                self.claims.refused(identity, link.peer)
-            raise
-        if stream.reliable:
-            relayed.source = None  # one answer for all who are absent
-            moves = self.streams.moves
-            moves.named_by_source = frozenset(map(ClientName, announcement.required))
-            self.absent.hold(announcement.required, identity, link, now)
-            moves.named_by_source = frozenset()
-        relayed.source = link
-        self.streams.moves.came(relayed, now=now)
-        self.streams.answer(relayed, now)
-        return None
-
-    def on_retract(self, link: Link, stream: InStream, *, now: float) -> None:
-        identity = stream.stream.id
-        relayed = self.relayed.get(identity)
-        if relayed is not None and relayed.source is not link and (is_peer(link.peer) or self.routing.via(identity)):
-            return  # it comes from elsewhere by now
-        if is_peer(link.peer) and not self.streams.moves.ends_for_good(identity, link.peer, now=now):
-            return
-        if identity.topic != OBJECTS_TOPIC:
-            self.streams.retract(link, stream, now)
-
-    def on_message(self, link: Link, stream: InStream, message: Message, *, now: float) -> None:
-        if stream.stream.id.topic == OBJECTS_TOPIC:
-            self.exchange.message(link, stream, message, now=now)
-        else:
-            self.forwarding.message(link, stream, message, now)
-
-    def on_in_drop(self, link: Link, stream: InStream, reason: DropReason, nbytes: int, count: int) -> None:
-        self.received.of(stream.stream).drop_arrived(reason, count)
-
-    def on_out_drop(self, link: Link, channel: OutChannel, outs: Sequence[OutMessage], reason: DropReason) -> None:
-        self.exchange.dropped(link, channel)
-        relayed = self.streams.reports(link, channel, reason)
-        if relayed is None or relayed.source is None:
-            return
-        now, source = link.now, relayed.source
-        first, last = outs[0].seq, outs[-1].seq  # the origin counts what it has not counted of them
-        report = partial(source.answers.report, relayed.stream, first, reason, link.peer, last - first + 1)
-        self.clients.attempt(source.peer, now, report)
-
-    def on_delivered(self, link: Link, channel: OutChannel, *, now: float) -> None:
-        relayed = self.relayed.get(channel.stream.id)
-        if relayed is not None:
-            link.reassembly.work_us += len(relayed.outs) // CONFIRMED_PER_US
-            self.streams.confirm(relayed)
-        else:
-            self.exchange.delivered(link, channel, now=now)
-
-    def on_refused(self, link: Link, channel: OutChannel, code: str, text: str, *, now: float) -> None:
-        self.events.refused(link.peer, code, text)
-        if code == NOT_THERE and is_peer(link.peer):
-            self.offers_again.refused(link.peer, channel, now=now)
-
-    def on_skipped(self, link: Link, stream: InStream, count: int, *, now: float) -> None:
-        """Messages of the origin that were given up before they got here: subscribers go on behind them."""
-        relayed = self.relayed.get(stream.stream.id)
-        if relayed is None or not stream.reliable:
-            return
-        for client, (out_link, channel) in relayed.outs.items():
-            skip = partial(out_link.outgoing.skip, channel, stream.delivered + 1, now=now, silent=stream.paused)
-            self.clients.attempt(client, now, skip)
-
-    def on_wanted(self, link: Link, channel: OutChannel, *, now: float) -> None:
-        """What a client subscribed to it gets; a peer says who gets it behind it, and the origin is to know."""
-        if is_peer(link.peer):
-            self.streams.refresh_interest([channel.stream.id], now=now)
-            self.streams.moves.named(link, channel, now=now)
-
-    def on_definition(self, link: Link, digest: str, *, now: float) -> None:
-        link.reassembly.work_us += len(self.links) + len(self.relayed) // STREAMS_PER_US
-        for identity, relayed in self.relayed.items():
-            if relayed.stream.stream.definition_hash == digest:
-                self.objects.redescribe(identity, now=now)
-        for client, other in self.links.items():
-            self.clients.attempt(client, now, partial(other.definition_known, digest, now=now))
-
-    def on_control(self, link: Link, envelope: framing.Envelope, attachment: bytes, *, now: float) -> None:
-        kind = envelope["t"]
-        if kind == "subscribe":
-            self.subscriptions.told(link.peer, envelope, now)
-        elif kind == "objects":
-            self.subscriptions.objects(link, envelope, now)
-        elif is_peer(link.peer):
-            self.from_peers.message(link, kind, envelope, attachment, now)
-        elif kind == "key":
-            link.reassembly.work_us += KEYS_US
-            told = ClientKeys(
-                relay=tuple(framing.take_strings(envelope, "relay", max_length=64)),
-                kept=framing.take_bool(envelope, "kept"),
-                key=framing.take_str(envelope, "key", max_length=64, default=""),
-            )
-            self.events.keys_told(link.peer, told)
-        elif kind == "lane_ask":
-            link.reassembly.work_us += LANE_US
-            self.events.lane_asked(link.peer, framing.take_strings(envelope, "ciphers", max_length=64))
-        else:
-            raise WireError(f"unknown control message {kind!r}")
 
     def validate(self) -> None:
         """Internal consistency, for tests."""

@@ -167,13 +167,13 @@ def test_a_message_that_vanishes_is_found(where: str, monkeypatch: pytest.Monkey
 
         monkeypatch.setattr(OutChannel, "submit", forgets)
     else:
-        core = stage.world.relay.hub if where == "relay" else stage.site.core
-        on_message = core.on_message
+        handler = stage.world.relay.hub.link_handler if where == "relay" else stage.site.core
+        on_message = handler.on_message
 
         def loses(link: Link, stream: object, message: Message, *, now: float) -> None:
             if message.stream.topic != TOPIC or not once(message.seq):
                 on_message(link, stream, message, now=now)  # type: ignore[arg-type]
 
-        monkeypatch.setattr(core, "on_message", loses)
+        monkeypatch.setattr(handler, "on_message", loses)
     found = stage.play()
     assert vanished and found.faults.keys() == set(vanished)
