@@ -29,6 +29,7 @@ from sern_core.relay.far_objects import PEER_BYTES
 from sern_core.relay.feed_owners import FeedOwners
 from sern_core.relay.forwarding import Forwarding
 from sern_core.relay.holding import Holding
+from sern_core.relay.home_changes import HomeChanges
 from sern_core.relay.hub_checks import check_channels, check_streams, taken
 from sern_core.relay.hub_events import GuardedEvents, HubEvents, Relayed
 from sern_core.relay.hub_link_handler import HubLinkHandler
@@ -47,7 +48,6 @@ from sern_core.relay.revocations import Revocations
 from sern_core.relay.route_change import RouteChange
 from sern_core.relay.routing import RoutingTable
 from sern_core.relay.traces import Traces
-from sern_core.vocabulary.errors import RefusedError
 from sern_core.vocabulary.key_news import RelayKeys
 from sern_core.vocabulary.names import is_peer, peer_name
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
@@ -188,6 +188,10 @@ class Hub:
         self.subscriptions = Subscriptions(
             clients, self.events, self.presence, self.matching, self.routing, streams, self.exchange, self.absent
         )
+        self._home_changes = HomeChanges(
+            clients, self.routing, streams, self.events, self.presence, self.matching, self.exchange, self.absent,
+            self.peers,
+        )  # fmt: skip
         self.link_handler = HubLinkHandler(
             clients,
             self.routing,
@@ -367,43 +371,10 @@ class Hub:
         self.streams.apply(self.routing.judge(owner), now)
 
     def _displaced(self, client: ClientName, peer: ClientName, now: float) -> None:
-        """A client that has a session here has begun another one at a peer."""
-        self.clients.went_over(client, peer[1:], now=now)
-        self.events.went_over(client, peer, came=False)
+        self._home_changes.displaced(client, peer, now)
 
     def _moved(self, client: ClientName, now: float) -> None:
-        """A client has come to a peer, or left it. What is held for it here goes there."""
-        self.presence.changed(client, now=now)
-        peer = self.peers.home(client)
-        if peer is not None:
-            self.exchange.went(client, now=now)
-            self._from_peer(client, peer, now)
-            for identity in self.routing.streams_of(client):
-                if self.routing.via(identity) is None:
-                    self.streams.relocate(identity, peer, now)
-            if self.routing.rights.saw(peer, client):
-                self.routing.peer_has(peer)
-                self.matching.look(peer, now=now)
-        if peer is not None and client in self.links:
-            self.absent.forget(client)
-            self.matching.forget(client)
-            self.streams.moves.went(client, peer, now=now)
-
-    def _from_peer(self, client: ClientName, peer: ClientName, now: float) -> None:
-        """Streams of the client that the peer has announced all along come from there now."""
-        link = self.links.get(peer)
-        if link is None:
-            return
-        for identity in self.routing.streams_of(client):
-            stream, relayed = link.taking.streams.get(identity), self.relayed[identity]
-            if stream is None or stream.channel_id is None or relayed.source is link:
-                continue
-            try:
-                self.streams.take(link, stream, now).source = link
-            except RefusedError as refusal:
-                self.events.refused(peer, refusal.code, str(refusal))
-            else:
-                self.streams.answer(relayed, now)
+        self._home_changes.moved(client, now)
 
     def _judge(self, peer: ClientName, now: float) -> None:
         """What the rules of a peer grant has changed."""
