@@ -124,7 +124,7 @@ class Hub:
             wall_us=wall_us,
         )
         """The other relays, where there is a fabric."""
-        self.routing.stays = self.feeds.stay
+        self.routing.rights.stays = self.feeds.stay
         self.routing.rights.home = self.peers.home
         self.rules = RulesExchange(
             access.rules, clients, self.routing.rights, self.events, reached=self.peers.reached, judge=self._judge

@@ -8,8 +8,9 @@ taken, and of the subscriptions that arrive meanwhile only the newest counts: ea
 from collections.abc import Callable
 from typing import Final
 
+from sern_core.relay.interest import UNIT_S
 from sern_core.relay.route_change import RouteChange
-from sern_core.relay.routing import UNIT_S, RoutingTable
+from sern_core.relay.routing import RoutingTable
 from sern_core.vocabulary.types import ClientName
 
 MATCHING_SHARE: Final = 1.0 / 3.0
@@ -55,7 +56,7 @@ class Matching:
             self._apply(self._routing.go_on(client), now)
         else:
             self._subscribe(client, patterns, now)
-        self._rested_s[client] = now + self._routing.spent_units * UNIT_S / MATCHING_SHARE
+        self._rested_s[client] = now + self._routing.spent.units * UNIT_S / MATCHING_SHARE
         self.due_s.pop(client, None)
         self.look(client, now=now)
 

@@ -1,4 +1,4 @@
-"""What the relay's table of streams and interests is made of, and what one client may hold in it."""
+"""What the relay's table of streams and interests is made of, what one client may hold in it, and what work costs."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -11,6 +11,14 @@ from sern_core.vocabulary.types import ClientName, TopicName
 
 PEER_TIMES: Final = 64
 """A peer speaks for many clients: it may want so many times as much as one."""
+UNIT_S: Final = 4e-9
+"""What one instruction of a pattern's program costs for one character at most, roughly: the unit of what follows."""
+NAME_UNITS: Final = 500
+"""A look at one name, access included."""
+ROUTE_UNITS: Final = 20_000
+"""What follows from a route that comes or goes: a channel, its announcement, an answer to the origin."""
+COMPILE_UNITS: Final = 200
+"""Compiling, for each instruction of the program and each character of a pattern."""
 
 
 class BadPatternError(RefusedError):
@@ -34,6 +42,15 @@ class RoutingLimits:
     """What all clients may have together: what fits into the channel numbers of one that takes everything."""
     slice_units: int = 2_000_000
     """Matching that is done in one go."""
+
+
+class WorkMeter:
+    """Counts what one call of the routing table costs, in units of `UNIT_S`."""
+
+    __slots__ = ("units",)
+
+    def __init__(self) -> None:
+        self.units = 0
 
 
 class Interest:

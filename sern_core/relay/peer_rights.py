@@ -12,7 +12,7 @@ who subscribes both need to know something of the other:
 Rates and queues are bounded by the rules of a client's own relay alone.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from typing import Final
 
 from sern_core.relay.access import AccessTable, Right
@@ -43,6 +43,8 @@ class PeerRights:
         self.rules: dict[ClientName, AccessTable | None] = {}
         self.home: Callable[[ClientName], ClientName | None] = lambda _client: None
         """Names the peer that a client is at; set by the owner."""
+        self.stays: Container[ClientName] = ()
+        """Origins whose streams no peer gets; set by the owner."""
         self._seen: dict[ClientName, _Seen] = {}
         self._tried: dict[tuple[ClientName, TopicName], int] = {}  # how many of `_seen` may not have it
         self._tried_by: AccessTable | None = None

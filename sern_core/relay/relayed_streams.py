@@ -11,10 +11,11 @@ from sern_core.relay.clients import Clients
 from sern_core.relay.draining import Draining
 from sern_core.relay.hub_events import GuardedEvents, Relayed
 from sern_core.relay.hub_fanout import Fanout
+from sern_core.relay.interest import UNIT_S
 from sern_core.relay.moves import Moves
 from sern_core.relay.presence import Presence
 from sern_core.relay.route_change import RouteChange
-from sern_core.relay.routing import UNIT_S, RoutingTable
+from sern_core.relay.routing import RoutingTable
 from sern_core.stream.in_stream import InStream
 from sern_core.stream.latched import ReplayStore, as_replays, newest_that_fit, waiting_bytes
 from sern_core.stream.out_channel import OutChannel
@@ -62,7 +63,7 @@ class RelayedStreams:
         self._ended = ended
         self._home = home
         self.moves = Moves(clients, routing, self, home=home)
-        routing.route_units = self._replay_units
+        routing.interest.route_units = self._replay_units
         self.by_id: dict[StreamId, Relayed] = {}
         self.replays = ReplayStore(cache_bytes)
         self.fanout = Fanout(self.offer, self.told, self._let_go)
@@ -107,7 +108,7 @@ class RelayedStreams:
                     self.replays.close(refused.cache)
             raise
         if source is not None:  # beside the channels that it opens or ends
-            matching_us = int(self._routing.spent_units * UNIT_S * 1e6)
+            matching_us = int(self._routing.spent.units * UNIT_S * 1e6)
             source.reassembly.work_us += STREAM_US * (1 + len(change.removed)) + matching_us
         relayed.keep_latched(self.replays)
         if change.added:

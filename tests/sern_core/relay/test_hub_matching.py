@@ -1,11 +1,9 @@
 """The relay matches patterns in slices: what a client subscribes to holds up nobody, and all of it comes in the end."""
 
-from sern_core.relay import routing
 from sern_core.relay.access import AccessRule, AccessTable
 from sern_core.relay.hub import HubParams
 from sern_core.relay.hub_matching import MATCHING_SHARE
-from sern_core.relay.interest import RoutingLimits
-from sern_core.relay.routing import UNIT_S
+from sern_core.relay.interest import ROUTE_UNITS, UNIT_S, RoutingLimits
 from tests.fuzz.test_hostile_peer import Hostile
 from tests.world import World, spec
 
@@ -55,12 +53,12 @@ def flood(world: World, mallory: Hostile, *, subscriptions: int) -> list[int]:
     hub = world.relay.hub
     done: list[int] = []
     for number in range(subscriptions):
-        before = hub.routing.spent_units = 0
+        before = hub.routing.spent.units = 0
         mallory.control({"t": "subscribe", "patterns": [f"/x{number}.+", *HOSTILE], "more": False})
         mallory.now += 1.0 / subscriptions
         mallory.port.handle_timeout(now=mallory.now)
-        if hub.routing.spent_units != before:
-            done.append(hub.routing.spent_units)
+        if hub.routing.spent.units != before:
+            done.append(hub.routing.spent.units)
     return done
 
 
@@ -75,7 +73,7 @@ def test_a_flood_of_subscriptions_is_worth_its_share_of_time() -> None:
     assert sum(done) * UNIT_S < 1.1 * MATCHING_SHARE + RoutingLimits().slice_units * UNIT_S
     while (due_s := world.relay.hub.matching.due_s.get(mallory.name)) is not None:
         mallory.port.handle_timeout(now=due_s)
-    assert "/x499.+" in world.relay.hub.routing._interests[mallory.name].patterns.texts  # the last one counts
+    assert "/x499.+" in world.relay.hub.routing.interest._interests[mallory.name].patterns.texts  # the last one counts
     world.relay.hub.validate()
 
 
@@ -86,12 +84,12 @@ def test_without_rights_patterns_cost_next_to_nothing() -> None:
     mallory.now = world.relay.now
     mallory.control({"t": "subscribe", "patterns": [".?" * 26 + "!"], "more": False})
     hub = world.relay.hub
-    assert hub.routing.spent_units < 0.2 * RoutingLimits().slice_units
+    assert hub.routing.spent.units < 0.2 * RoutingLimits().slice_units
     assert not hub.matching.due_s
 
 
 def test_new_access_rules_are_worked_out_over_time() -> None:
-    world = World(hub_params=HubParams(routing=RoutingLimits(slice_units=10 * routing.ROUTE_UNITS)))
+    world = World(hub_params=HubParams(routing=RoutingLimits(slice_units=10 * ROUTE_UNITS)))
     topics(world, 100)
     sites = [world.client(name, patterns=["/.*[ab].*"]) for name in ("site1", "site2", "site3")]
     world.run(2.0)

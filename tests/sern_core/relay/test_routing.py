@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
 
 from sern_core.relay.access import AccessRule, AccessTable
-from sern_core.relay.interest import RoutingLimits
+from sern_core.relay.interest import NAME_UNITS, RoutingLimits
 from sern_core.relay.route_change import NO_CHANGE, Denied, Match, RouteChange
-from sern_core.relay.routing import NAME_UNITS, RoutingTable
+from sern_core.relay.routing import RoutingTable
 from sern_core.vocabulary.errors import RefusedError
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.vocabulary.types import ClientName, Encoding, PriorityClass, TopicName
@@ -272,9 +272,9 @@ def full_table(access: AccessTable = OPEN, *, topics: int = 500) -> RoutingTable
 def test_a_pattern_is_not_matched_with_what_the_client_may_not_have() -> None:
     table = full_table(AccessTable([AccessRule("a", publish=(".*",)), AccessRule("c", subscribe=(".*_7",))]))
     table.subscribe(B, HOSTILE)
-    cost_without_rights = table.spent_units
+    cost_without_rights = table.spent.units
     table.subscribe(C, HOSTILE)
-    assert 1 < table.spent_units / cost_without_rights < 1.5  # one name of 500
+    assert 1 < table.spent.units / cost_without_rights < 1.5  # one name of 500
     assert not table.unfinished(B) and not table.unfinished(C)
 
 
@@ -285,7 +285,7 @@ def test_hostile_patterns_are_matched_in_slices() -> None:
     matched = list(change.matched)
     slices = 1
     while table.unfinished(B):
-        largest_units = max(largest_units, table.spent_units)
+        largest_units = max(largest_units, table.spent.units)
         table.validate()
         matched += table.go_on(B).matched
         slices += 1
@@ -350,7 +350,7 @@ def test_one_more_name_costs_one_look_and_has_an_end() -> None:
         table.announce(stream(A, f"/t{index}"))
         change = table.also(B, TopicName(f"/t{index}"))
         assert [match.stream.topic for match in change.matched] == [f"/t{index}"]
-        assert table.spent_units == NAME_UNITS and not table.unfinished(B)
+        assert table.spent.units == NAME_UNITS and not table.unfinished(B)
     with pytest.raises(RefusedError) as refused:
         table.also(B, TopicName("/another"))
     assert refused.value.code == "too_many_patterns"

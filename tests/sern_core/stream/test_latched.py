@@ -8,9 +8,8 @@ from hypothesis import strategies as st
 
 from sern_core.relay.access import AccessRule, AccessTable
 from sern_core.relay.hub import HubParams
-from sern_core.relay.interest import RoutingLimits
+from sern_core.relay.interest import UNIT_S, RoutingLimits
 from sern_core.relay.relayed_streams import REPLAY_US
-from sern_core.relay.routing import UNIT_S
 from sern_core.stream.latched import MAX_REPLAY_MESSAGES, LatchedCache, ReplayStore
 from sern_core.stream.out_channel import OutChannel
 from sern_core.stream.prices import CLIENT_OVERHEAD_BYTES, MESSAGE_OVERHEAD_BYTES

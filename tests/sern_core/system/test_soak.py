@@ -26,9 +26,9 @@ VISITS = 10
 PAUSE_S = 2 * 24 * 3600.0
 STATIC = frozenset(
     {
-        ".routing._access._cache",  # decisions, at most CACHE_ENTRIES
-        ".routing._access._grants",
-        ".routing._access._grants[][]._exact",
+        ".clients.access._cache",  # decisions, at most CACHE_ENTRIES
+        ".clients.access._grants",
+        ".clients.access._grants[][]._exact",
         ".objects._deletions",  # a ring
         ".link.lanes.clock._stepped",  # a ring
         ".link.taking._had",  # where reliable streams ended: at most MAX_REMEMBERED
