@@ -178,7 +178,8 @@ class Flow:
         limited = self._bulk(now)
         flight.sent(now=now, nbytes=nbytes, items=[chunk], app_limited=not limited)
         self.estimator.on_sent(now=now, nbytes=nbytes, inflight_bytes=inflight_bytes)
-        self.pacer.sent(now=now, nbytes=nbytes, pacing_bps=self.estimator.pacing_bps)
+        waits = limited and inflight_bytes < self.estimator.window_bytes
+        self.pacer.sent(now=now, nbytes=nbytes, pacing_bps=self.estimator.pacing_bps, waits=waits)
         self._ping_due_s = now + 0.5
         self.sent_packets += 1
         if self.stalled:

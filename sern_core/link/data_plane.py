@@ -131,7 +131,8 @@ class DataPlane:
         flight.sent(now=now, nbytes=nbytes, items=draft.items, app_limited=app_limited, priority=lane.priority)
         estimator.on_sent(now=now, nbytes=nbytes, inflight_bytes=inflight_bytes)
         pacer = lane.pacer
-        pacer.sent(now=now, nbytes=nbytes, pacing_bps=estimator.pacing_bps)
+        paced = waits and inflight_bytes < estimator.window_bytes
+        pacer.sent(now=now, nbytes=nbytes, pacing_bps=estimator.pacing_bps, waits=paced)
         if lane is lanes.lane and (rate_bps := estimator.rate_bps) is not None:
             full_s = 8 * (lane.fragment_bytes + OVERHEAD_BYTES) / rate_bps
             pacer.due_s = self._sender.cadences.hold(pacer.due_s, full_s)

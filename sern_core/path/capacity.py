@@ -13,7 +13,10 @@ from typing import Final
 from mypy_extensions import mypyc_attr
 
 PACING_BURST_S: Final = 0.001
-"""A timer may be this late; what could have left meanwhile leaves at once."""
+"""A timer may be this late; what could have left meanwhile leaves at once..."""
+PACING_LATE_S: Final = 0.02
+"""... and this late where something waited for it all the time: on a busy machine it is. What does not leave then is not
+seen to arrive, and a window that is steered by what arrives would follow the timers."""
 PACING_DEBT_S: Final = 0.1
 
 
@@ -129,23 +132,25 @@ class CapacityEstimator(ABC):
 class Pacer:
     """Spreads what the window allows over time. Class 0 does not wait for it, but counts."""
 
-    __slots__ = ("_bps", "_next_s", "due_s")
+    __slots__ = ("_bps", "_late_s", "_next_s", "due_s")
 
     def __init__(self) -> None:
         self._bps = 0.0  # the pace of the latest datagram
         self._next_s = 0.0
+        self._late_s = PACING_BURST_S  # what is not used until then may be made good
         self.due_s = 0.0
         """When the next datagram may leave. May be put off: what is not used then is made good like a late timer."""
 
     def ready(self, now: float) -> bool:
         return now >= self.due_s
 
-    def sent(self, *, now: float, nbytes: int, pacing_bps: float | None) -> None:
-        """`nbytes` left. Of the time that was not used no more is saved up than a timer may be late; and what does not
+    def sent(self, *, now: float, nbytes: int, pacing_bps: float | None, waits: bool = False) -> None:
+        """`nbytes` left; `waits`: more waits, for the pacer alone. Of the time that was not used no more is saved up than a timer may be late; and what does not
         ask, class control, keeps the others waiting for its own time or `PACING_DEBT_S` at most. Without that bound a
         moment of a very low pace would hold them back for as long as class control had exceeded it."""
         if pacing_bps is not None:
-            earliest_s = now - PACING_BURST_S
+            earliest_s = now - self._late_s
+            self._late_s = PACING_LATE_S if waits else PACING_BURST_S
             own_s = 8 * nbytes / pacing_bps
             begin_s = self._next_s if self._next_s > earliest_s else earliest_s
             self.due_s = self._next_s = max(begin_s, min(begin_s + own_s, now + max(own_s, PACING_DEBT_S)))

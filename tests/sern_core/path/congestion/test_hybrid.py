@@ -3,6 +3,7 @@
 Times are those of the simulated network, so they are the same on every machine and may be asserted.
 """
 
+from dataclasses import replace
 from functools import cache
 from math import inf
 from statistics import fmean
@@ -367,6 +368,27 @@ def test_the_pacer_gives_back_what_a_late_timer_lost() -> None:
     assert 8 * left / 10.0 == pytest.approx(4e6, rel=0.01)
     pacer.sent(now=20.0, nbytes=1250, pacing_bps=None)
     assert pacer.ready(20.0)
+
+
+@pytest.mark.parametrize("waits", [False, True])
+def test_what_waited_for_a_busy_machines_timer_is_made_good(*, waits: bool) -> None:
+    """And what was not there meanwhile is not: it leaves no faster than the pace."""
+    pacer = Pacer()
+    left, now = 0, 0.0
+    while now < 10.0:
+        while pacer.ready(now):
+            pacer.sent(now=now, nbytes=1250, pacing_bps=4e6, waits=waits)
+            left += 1250
+        now += 0.010
+    assert 8 * left / 10.0 == pytest.approx(4e6 if waits else 1e6, rel=0.1)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_late_timers_do_not_hide_a_faster_link(seed: int) -> None:
+    steps = (RateStep(5.0, 1e6), RateStep(15.0, 4e6))
+    world = run(replace(link(8e6, 0.05), rate_steps=steps), 20.0, seed=seed, tick_s=0.010)
+    assert world.goodput_bps(16.0, 20.0) > 0.85 * carries_bps(4e6)
+    assert at(world.poses_ms(16.0), 0.99) < 25.0 + 25.0
 
 
 def test_our_own_slowness_is_not_taken_for_the_links() -> None:
