@@ -15,8 +15,8 @@ from mypy_extensions import mypyc_attr
 PACING_BURST_S: Final = 0.001
 """A timer may be this late; what could have left meanwhile leaves at once..."""
 PACING_LATE_S: Final = 0.02
-"""... and this late where something waited for it all the time: on a busy machine it is. What does not leave then is not
-seen to arrive, and a window that is steered by what arrives would follow the timers."""
+"""... and this late where something waited for it all the time: on a busy machine it is. What does not leave then is
+not seen to arrive, and a window that is steered by what arrives would follow the timers."""
 PACING_DEBT_S: Final = 0.1
 
 
@@ -145,9 +145,10 @@ class Pacer:
         return now >= self.due_s
 
     def sent(self, *, now: float, nbytes: int, pacing_bps: float | None, waits: bool = False) -> None:
-        """`nbytes` left; `waits`: more waits, for the pacer alone. Of the time that was not used no more is saved up than a timer may be late; and what does not
-        ask, class control, keeps the others waiting for its own time or `PACING_DEBT_S` at most. Without that bound a
-        moment of a very low pace would hold them back for as long as class control had exceeded it."""
+        """`nbytes` left; `waits`: more waits, for the pacer alone. Of the time that was not used no more is saved up
+        than a timer may be late; and what does not ask, class control, keeps the others waiting for its own time or
+        `PACING_DEBT_S` at most. Without that bound a moment of a very low pace would hold them back for as long as
+        class control had exceeded it."""
         if pacing_bps is not None:
             earliest_s = now - self._late_s
             self._late_s = PACING_LATE_S if waits else PACING_BURST_S
