@@ -17,7 +17,8 @@ from sern_client.services import ServiceBridge
 from sern_client.site import Site
 from sern_client.spool.spool import Spool
 from sern_core.link.handshake import DISPLACED
-from sern_core.site.client import ClientCore, ClientEvents
+from sern_core.site.client import ClientCore
+from sern_core.site.client_events import ClientEvents
 from sern_core.site.services import parse as parse_service
 from sern_core.topics.rules import Discovery, RuleSet
 from sern_core.topics.spool_names import parse as parse_spooled

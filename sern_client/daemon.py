@@ -41,7 +41,8 @@ from sern_client.told import ClientTold
 from sern_client.views import ClientViews
 from sern_core.bodies.lossy import missing
 from sern_core.objects.feed import PERIOD_S
-from sern_core.site.client import ClientCore, ClientEvents
+from sern_core.site.client import ClientCore
+from sern_core.site.client_events import ClientEvents
 from sern_core.topics.patterns import PatternSet, compile_pattern
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.key_news import RelayKeys

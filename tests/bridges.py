@@ -6,7 +6,8 @@ from typing import Any
 from sern_client.bridge import Bridge
 from sern_client.endpoints.base import Difference, Held, Sink, TopicEvents
 from sern_client.site import Site
-from sern_core.site.client import ClientCore, ClientEvents
+from sern_core.site.client import ClientCore
+from sern_core.site.client_events import ClientEvents
 from sern_core.topics.rules import Discovery, DiscoveryMode, RuleSet, TopicRule
 from sern_core.vocabulary.key_news import RelayKeys
 from sern_core.vocabulary.message import TopicInfo

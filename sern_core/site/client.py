@@ -4,98 +4,38 @@ The shell (sern_client) feeds it endpoint messages and lane bytes, and is told t
 appear and which messages have their turn. Everything about bandwidth, order, replay and loss is in the link below.
 """
 
-from collections.abc import Callable, Collection, Iterable, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
-from typing import ParamSpec, Protocol
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
 
 from sern_core.bodies.codecs import CodecProfile, Coder
 from sern_core.link.definitions import DefinitionStore
 from sern_core.link.link import Link
 from sern_core.objects.changes import OBJECTS_TOPIC
+from sern_core.site.client_events import ClientEvents, ClientShell
 from sern_core.site.object_mirror import ObjectMirror, Selection
 from sern_core.site.own_objects import OwnObjects
 from sern_core.site.peers import Peers, PeerView
+from sern_core.site.remote_streams import RemoteStreams
 from sern_core.site.subscription import Subscription
-from sern_core.stream.decoding import Decoder
 from sern_core.stream.in_stream import InStream
 from sern_core.stream.latched import LatchedCache
 from sern_core.stream.out_channel import OutChannel
 from sern_core.stream.out_message import OutMessage, in_sequence
 from sern_core.summaries.spec import SummaryLevel
 from sern_core.vocabulary.codec_names import Compression
-from sern_core.vocabulary.errors import ConfigError, WireError
+from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.key_news import ClientKeys, RelayKeys
-from sern_core.vocabulary.ledger import MAX_TOPICS, ReceiveLedger
+from sern_core.vocabulary.ledger import ReceiveLedger
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
 from sern_core.vocabulary.trace import LINK, DecisionTrace, TraceEvent
-from sern_core.vocabulary.types import ClientName, DropReason, TopicName
+from sern_core.vocabulary.types import ClientName, DropReason
 from sern_core.wire import framing
 from sern_core.wire.announce import Announcement, check_stream
 from sern_core.wire.numbering import Numbering
 
-P = ParamSpec("P")
-
 RELAY_NAME = ClientName("relay")
 """What the relay is called until its WELCOME says its own name."""
-
-
-class ClientEvents(Protocol):
-    """What the shell is told."""
-
-    def link_up(self, *, resumed: bool) -> None: ...
-
-    def link_down(self, reason: str) -> None: ...
-
-    def rejected(self, code: str, text: str) -> None:
-        """The relay refused the session."""
-
-    def lane_offered(self, parameters: framing.Envelope) -> None:
-        """The relay has opened a datagram session for us; open the socket, then call `ClientCore.link.open_lane`."""
-
-    def lane_closed(self) -> None:
-        """The datagram lane ended with its session: close its socket."""
-
-    def keys_told(self, keys: RelayKeys) -> None:
-        """The relay tells of its keys, and what became of the one that it was offered."""
-
-    def stream_opened(self, stream: StreamInfo) -> None:
-        """A stream from elsewhere, definition included. Raises ConfigError if this site cannot publish it."""
-
-    def stream_closed(self, stream: StreamInfo) -> None: ...
-
-    def message(self, stream: StreamInfo, message: Message, *, now: float) -> DropReason | None:
-        """A message of an open stream has its turn. Returns why it was not taken; None: it was."""
-
-    def expired(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
-        """A reliable message of a stream from elsewhere was dropped on its way; it is reported in its turn."""
-
-    def skipped(self, stream: StreamInfo, count: int) -> None:
-        """`count` messages of a reliable stream were given up before this site was told of it again."""
-
-    def send_dropped(self, stream: StreamInfo, first: int, count: int, reason: DropReason, where: str) -> None:
-        """Messages of ours, `count` from seq `first` on, were dropped: here (`where` is empty), or further on for the
-        client `where`. There may be 100,000 of them: nothing is to be done for each. Where they lie in very
-        many runs, one run has them all, and what lies between them, which was told before."""
-
-    def wanted(self, stream: StreamInfo, wanted: bool) -> None:
-        """Whether anybody at the far side wants a stream of ours; said again after every change."""
-
-    def publication_refused(self, stream: StreamInfo, code: str, text: str) -> None: ...
-
-    def subscription_refused(self, code: str, text: str) -> None:
-        """Something that this site named is not ours to have, or the relay takes none of our patterns."""
-
-    def object_refused(self, object_id: str, code: str, why: str) -> None:
-        """The relay did not take an object of ours. Of many at once some are told."""
-
-    def undecodable(self, stream: StreamInfo, problem: str) -> None:
-        """The body of a message could not be decoded: it is dropped. Said once for each topic."""
-
-    def fault(self, error: Exception) -> None:
-        """Something raised what nobody expects, in the core or in one of these methods: log it with its traceback and
-        count it. What it was about is given up, everything else goes on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,11 +55,6 @@ class KeptMessage:
     body: bytes
     stamp_ns: int
     age_s: float
-
-
-def _announced(stream: StreamInfo) -> StreamInfo:
-    """What its origin says of a stream, without what is filled in here."""
-    return replace(stream, info=replace(stream.info, definition=""), definition_hash="")
 
 
 class ClientCore:
@@ -144,27 +79,20 @@ class ClientCore:
         self.name = name
         self.boot = boot
         self.events = events
+        self.shell = ClientShell(events)
+        """Tells the shell, and counts errors of ours."""
         self.trace = trace or DecisionTrace(enabled=False)
         self._runs_told = link.limits.runs_told
         self.definitions = DefinitionStore()
         self.received = ReceiveLedger()
         """Counters of what arrives, by topic: delivered, and dropped on arrival for a reason."""
-        self.faults = 0
-        """Errors of ours so far that nobody expects."""
         self.peers = Peers()
         """The clients whose streams this one takes, and whether they are there."""
         self.attributes: dict[str, str] = {}
         """Metadata of this node, for the object registry."""
         self._numbering = Numbering()  # of topics that were offered before
         self._latched: dict[StreamId, LatchedCache] = {}  # for a relay that comes back with nothing
-        self._open: dict[StreamId, StreamInfo] = {}  # as they were announced
-        self._refused: set[StreamId] = set()  # announced, but this site could not publish them
-        self._undecodable: set[TopicName] = set()
-        self._held: dict[StreamId, dict[int, None]] = {}  # handed on, and not to be confirmed yet
         self.coder = coder or Coder(max_bytes=link.max_message_bytes)
-        self._decoder = Decoder[InStream](
-            self.coder, lambda stream: stream.stream, self._handle, self._failed, self._settled, fault=self.fault
-        )
         self.link = Link(
             name=name,
             boot=boot,
@@ -178,9 +106,10 @@ class ClientCore:
             now=now,
             lossless=lossless,
         )
+        self._remote = RemoteStreams(self.link, self.shell, self.peers, self.received, self.coder)
         self.subscription = Subscription(self.link.control)
         self.objects = OwnObjects(self.link, boot=boot)
-        self.mirror = ObjectMirror(self.link.control, self._tell)
+        self.mirror = ObjectMirror(self.link.control, self.shell.tell)
         """Objects of others that this site subscribes to."""
         self.link.housekeeping.on_tidy = self._tidy
         self.link.receiver.on_stray = self.received.stray
@@ -282,7 +211,7 @@ class ClientCore:
     def subscribe(self, patterns: tuple[str, ...], *, now: float) -> None:
         """Full-match patterns of the global names this site wants; replaces the earlier ones."""
         self.subscription.patterns = patterns
-        self._tell(self.peers.subscribed, patterns, now=now)
+        self.shell.tell(self.peers.subscribed, patterns, now=now)
         if self.link.established:
             self.subscription.send(now)
 
@@ -298,25 +227,42 @@ class ClientCore:
         self.peers.reached(self.link.observe(now=now).up, now=now)
         return self.peers.look(now=now)
 
-    # --- errors of ours -------------------------------------------------------------------------------------------
+    def reconsider(self, *, now: float) -> None:
+        """Open what this site could not publish when it was announced, if it can now: another stream may have been in
+        its way, which has ended."""
+        self._remote.reconsider(now)
 
-    def fault(self, error: Exception) -> None:
-        """Tell the shell of an error that nobody expects."""
-        self.faults += 1
-        with suppress(Exception):  # counted above; there is nobody left to tell
-            self.events.fault(error)
+    def reopen(self, identities: Collection[StreamId], *, now: float) -> None:
+        """Close these streams from elsewhere for the shell, and open them anew: what holds for them here has changed.
+        The stream itself goes on."""
+        self._remote.reopen(identities, now)
 
-    def _tell(self, call: Callable[P, object], *args: P.args, **kwargs: P.kwargs) -> None:
-        """Tell the shell; what it raises stops nothing here."""
-        try:
-            call(*args, **kwargs)
-        except Exception as error:  # noqa: BLE001  (the shell's, and no reason to leave our own work half done)
-            self.fault(error)
+    @property
+    def refused(self) -> Collection[StreamId]:
+        """The streams from elsewhere that there are, and that this site could not publish."""
+        return self._remote.refused
+
+    @property
+    def opened(self) -> Collection[StreamId]:
+        """The streams from elsewhere that are open here."""
+        return self._remote.opened.keys()
+
+    def hold(self, identity: StreamId, seq: int) -> None:
+        """Called for the reliable message that is just being handed on: it is not confirmed before `release`."""
+        self._remote.held.setdefault(identity, {})[seq] = None
+
+    def release(self, identity: StreamId, seq: int, *, now: float, lost: DropReason | None = None) -> None:
+        """A message that was held has been dealt with, or was `lost` after all; then its origin is told."""
+        self._remote.release(identity, seq, lost, now)
+
+    def lease_expired(self, identity: StreamId, after_s: float, *, now: float) -> None:
+        """Called by whoever keeps the lease of a command topic: no fresh command came, and it is stopped."""
+        self.trace.record(now, identity.topic, TraceEvent.LEASE_EXPIRED, origin=identity.origin, after_s=after_s)
 
     # --- LinkHandler ----------------------------------------------------------------------------------------------
 
     def on_fault(self, link: Link, error: Exception, *, now: float) -> None:
-        self.fault(error)
+        self.shell.fault(error)
 
     def on_up(self, link: Link, *, resumed: bool, now: float) -> None:
         if not resumed:
@@ -328,221 +274,45 @@ class ClientCore:
         if not resumed:
             self.objects.lost()
         self.objects.pump(now=now)
-        self._tell(self.events.link_up, resumed=resumed)
+        self.shell.tell(self.events.link_up, resumed=resumed)
 
     def on_down(self, link: Link, reason: str, *, now: float) -> None:
-        self._tell(self.events.link_down, reason)
-        self._tell(self.peers.session_ended, now=now)
+        self.shell.tell(self.events.link_down, reason)
+        self.shell.tell(self.peers.session_ended, now=now)
 
     def on_lane_closed(self, link: Link) -> None:
-        self._tell(self.events.lane_closed)
+        self.shell.tell(self.events.lane_closed)
 
     def on_rejected(self, link: Link, code: str, text: str, *, now: float) -> None:
-        self._tell(self.events.rejected, code, text)
+        self.shell.tell(self.events.rejected, code, text)
 
     def on_announce(self, link: Link, announcement: Announcement, *, now: float) -> bool | None:
         stream = link.taking.streams[announcement.stream.id]
-        digest = announcement.definition_hash
         identity = stream.stream.id
         if not stream.stream.spec.durable:
             link.taking.outlived(identity.origin, identity.boot, now=now)
         if identity.topic == OBJECTS_TOPIC:
             return identity.origin == link.peer
-        opened = self._open.get(identity)
-        if opened is not None and opened != _announced(announcement.stream):
-            # Its origin ended it and began it anew while we were away, as something else.
-            self._close_stream(stream, now)
-            stream.stream = replace(announcement.stream, attributes={**announcement.stream.attributes})
-            stream.stream.definition_hash = digest
-        if digest and digest not in self.definitions:
-            return None  # asked for; answered when it is here
-        return self._open_stream(stream)
-
-    def _open_stream(self, stream: InStream) -> bool:
-        identity = stream.stream.id
-        if identity.origin == self.name:
-            return False  # our own, come back through somebody else
-        if identity not in self._open:
-            info = stream.stream.info
-            digest = stream.stream.definition_hash
-            complete = TopicInfo(
-                info.name,
-                info.type_name,
-                info.encoding,
-                info.type_hash,
-                self.definitions.get(digest),
-                info.latched,
-                info.reliable,
-            )
-            announced = _announced(stream.stream)
-            stream.stream = replace(stream.stream, info=complete)
-            if not self._opened(stream.stream):
-                self._refused.add(identity)
-                return False
-            self._refused.discard(identity)
-            self._open[identity] = announced
-            self._tell(self.peers.opened, identity.origin, now=self.link.now)
-        return True
-
-    def _opened(self, stream: StreamInfo) -> bool:
-        """Whether the shell can publish this stream."""
-        for _ in range(2):
-            try:
-                self.events.stream_opened(stream)
-            except ConfigError:
-                return False  # the shell has logged it; nothing else stops
-            except Exception as error:  # noqa: BLE001  (of one stream, whatever its definition holds; it may pass)
-                self.fault(error)
-                self._tell(self.events.stream_closed, stream)  # as far as it had come
-            else:
-                return True
-        return False
-
-    def reconsider(self, *, now: float) -> None:
-        """Open what this site could not publish when it was announced, if it can now: another stream may have been in
-        its way, which has ended."""
-        for stream in list(self.link.taking.incoming.values()):
-            if stream.stream.id in self._refused and self._open_stream(stream):
-                self.link.answers.answer(stream, True, now=now)
-
-    def reopen(self, identities: Collection[StreamId], *, now: float) -> None:
-        """Close these streams from elsewhere for the shell, and open them anew: what holds for them here has changed.
-        The stream itself goes on."""
-        for stream in list(self.link.taking.incoming.values()):
-            if stream.stream.id in identities and stream.stream.id in self._open:
-                self._close_stream(stream, now)
-                self.link.answers.answer(stream, self._open_stream(stream), now=now)
-
-    @property
-    def refused(self) -> Collection[StreamId]:
-        """The streams from elsewhere that there are, and that this site could not publish."""
-        return self._refused
-
-    @property
-    def opened(self) -> Collection[StreamId]:
-        """The streams from elsewhere that are open here."""
-        return self._open.keys()
-
-    def _close_stream(self, stream: InStream, now: float) -> None:
-        self._decoder.forget(stream.stream.id, now=now)
-        self._held.pop(stream.stream.id, None)
-        del self._open[stream.stream.id]
-        self._tell(self.peers.closed, stream.stream.id.origin, stream.stream.id.topic, now=now)
-        self._tell(self.events.stream_closed, stream.stream)
+        return self._remote.announced(stream, announcement, now)
 
     def on_definition(self, link: Link, digest: str, *, now: float) -> None:
-        for stream in list(link.taking.incoming.values()):
-            if stream.stream.definition_hash == digest:
-                link.answers.answer(stream, self._open_stream(stream), now=now)
+        self._remote.definition_known(digest, now)
 
     def on_retract(self, link: Link, stream: InStream, *, now: float) -> None:
-        self._refused.discard(stream.stream.id)
-        if stream.stream.id in self._open:
-            self._close_stream(stream, now)
+        self._remote.retracted(stream, now)
 
     def on_message(self, link: Link, stream: InStream, message: Message, *, now: float) -> None:
         if stream.stream.id.topic == OBJECTS_TOPIC:
             if not message.drop_marker:
                 self.mirror.message(message.body, now=now)
             return
-        decoder = self._decoder
-        decoder.message(stream, message, now=now)
-        stream.unhandled = self._oldest(message.stream) if decoder.running or self._held else 0
-
-    def _handle(self, stream: InStream, message: Message, now: float) -> None:
-        """A message has had its turn and is decoded."""
-        lifespan_s = stream.lifespan_s
-        if stream.unhandled and not stream.reliable and lifespan_s is not None and message.age_s(now) > lifespan_s:
-            self._failed(stream, message, DropReason.LIFESPAN, "", now)  # while it was decoded
-            return
-        if message.drop_marker:
-            reason = message.drop_reason
-            self.received.of(stream.stream).drop_arrived(reason)
-            self._tell(self.events.expired, stream.stream, message.seq, reason)
-            return
-        try:
-            refused = self.events.message(stream.stream, message, now=now)
-        except Exception as error:  # noqa: BLE001  (of one message: the stream goes on, whatever its bodies do)
-            self.fault(error)
-            self._failed(stream, message, DropReason.FAULT, "", now)
-        else:
-            if refused is not None:
-                self._failed(stream, message, refused, "", now)
-                return
-            self.received.of(stream.stream).arrived(len(message.body), now - message.born_s, now)
-            if self.trace.steps:
-                self.trace.record(
-                    now,
-                    message.stream.topic,
-                    TraceEvent.DELIVERED,
-                    message.seq,
-                    origin=message.stream.origin,
-                    age_s=now - message.born_s,
-                )
-            if not message.replay:  # which is the relay's
-                self.peers.arrived(message.stream.origin, now=now)
-
-    def _failed(self, stream: InStream, message: Message, reason: DropReason, problem: str, now: float) -> None:
-        """A message has had its turn and cannot be handed on."""
-        topic = stream.stream.id.topic
-        self.received.of(stream.stream).drop_arrived(reason)
-        self._arrival_dropped(stream.stream.id, message.seq, reason, now)
-        if self.link.end.fates is not None and (not stream.reliable or reason is DropReason.DISCONNECTED):
-            self.link.end.fates.discarded(stream.stream, message.seq, reason, self.link.peer)
-        told = self._undecodable
-        if reason is DropReason.UNDECODABLE and topic not in told and len(told) < MAX_TOPICS:
-            told.add(topic)
-            self._tell(self.events.undecodable, stream.stream, problem)
-        if stream.reliable and reason is not DropReason.DISCONNECTED:
-            self.link.answers.report(stream, message.seq, reason, self.name)
-            self._tell(self.events.expired, stream.stream, message.seq, reason)
-
-    def _settled(self, stream: InStream) -> None:
-        """A body is decoded, or dropped: the peer may be told how far the stream has come."""
-        identity = stream.stream.id
-        current = self.link.taking.streams.get(identity)
-        if current is not None:
-            self.link.taking.processed_below(current, self._oldest(identity))
-
-    def _oldest(self, identity: StreamId) -> int:
-        """The seq of the oldest message of a stream that has had its turn and is not dealt with, 0: none."""
-        decoding = self._decoder.oldest(identity)
-        if not self._held:
-            return decoding
-        held = next(iter(self._held.get(identity, ())), 0)
-        return min(decoding, held) if decoding and held else decoding or held
-
-    def hold(self, identity: StreamId, seq: int) -> None:
-        """Called for the reliable message that is just being handed on: it is not confirmed before `release`."""
-        self._held.setdefault(identity, {})[seq] = None
-
-    def release(self, identity: StreamId, seq: int, *, now: float, lost: DropReason | None = None) -> None:
-        """A message that was held has been dealt with, or was `lost` after all; then its origin is told."""
-        held = self._held.get(identity)
-        if held is None or seq not in held:
-            return  # the stream has ended
-        del held[seq]
-        if not held:
-            del self._held[identity]
-        stream = self.link.taking.streams.get(identity)
-        if stream is None:
-            return
-        if lost is not None:
-            self._arrival_dropped(identity, seq, lost, now)
-            self.link.answers.report(stream, seq, lost, self.name)
-            self.events.expired(stream.stream, seq, lost)
-        self._settled(stream)
+        remote = self._remote
+        remote.decoder.message(stream, message, now=now)
+        stream.unhandled = remote.oldest(message.stream) if remote.decoder.running or remote.held else 0
 
     def on_in_drop(self, link: Link, stream: InStream, reason: DropReason, nbytes: int, count: int) -> None:
         self.received.of(stream.stream).drop_arrived(reason, count)
-        self._arrival_dropped(stream.stream.id, 0, reason, link.now)
-
-    def _arrival_dropped(self, identity: StreamId, seq: int, reason: DropReason, now: float) -> None:
-        self.trace.record(now, identity.topic, TraceEvent.DROPPED, seq, reason=reason, origin=identity.origin)
-
-    def lease_expired(self, identity: StreamId, after_s: float, *, now: float) -> None:
-        """Called by whoever keeps the lease of a command topic: no fresh command came, and it is stopped."""
-        self.trace.record(now, identity.topic, TraceEvent.LEASE_EXPIRED, origin=identity.origin, after_s=after_s)
+        self._remote.note_drop(stream.stream.id, 0, reason, link.now)
 
     def on_out_drop(self, link: Link, channel: OutChannel, outs: Sequence[OutMessage], reason: DropReason) -> None:
         if self.objects.dropped(channel):
@@ -552,7 +322,7 @@ class ClientCore:
             runs = [outs]  # what lies between was told before
         for run in runs:
             first, count = run[0], run[-1].seq - run[0].seq + 1
-            self._tell(self.events.send_dropped, channel.stream, first.seq, count, reason, first.lost_to)
+            self.shell.tell(self.events.send_dropped, channel.stream, first.seq, count, reason, first.lost_to)
 
     def on_delivered(self, link: Link, channel: OutChannel, *, now: float) -> None:
         """The ledger has counted it."""
@@ -562,14 +332,14 @@ class ClientCore:
         if channel.stream.id.topic == OBJECTS_TOPIC:
             self.objects.pump(now=now)
         else:
-            self._tell(self.events.wanted, channel.stream, bool(channel.wanted))
+            self.shell.tell(self.events.wanted, channel.stream, bool(channel.wanted))
 
     def on_refused(self, link: Link, channel: OutChannel, code: str, text: str, *, now: float) -> None:
-        self._tell(self.events.publication_refused, channel.stream, code, text)
+        self.shell.tell(self.events.publication_refused, channel.stream, code, text)
 
     def on_skipped(self, link: Link, stream: InStream, count: int, *, now: float) -> None:
-        if stream.known and stream.stream.id in self._open:
-            self._tell(self.events.skipped, stream.stream, count)
+        if stream.known and stream.stream.id in self._remote.opened:
+            self.shell.tell(self.events.skipped, stream.stream, count)
 
     def on_control(self, link: Link, envelope: framing.Envelope, attachment: bytes, *, now: float) -> None:
         kind = envelope["t"]
@@ -577,7 +347,7 @@ class ClientCore:
             self.events.lane_offered(envelope)
         elif kind == "denied":
             code, why = framing.take_str(envelope, "code", max_length=64), framing.take_str(envelope, "why")
-            self._tell(self.events.subscription_refused, code, why)
+            self.shell.tell(self.events.subscription_refused, code, why)
         elif kind == "peers":
             self.peers.told(envelope, now=now)
         elif kind == "keys":
@@ -588,13 +358,13 @@ class ClientCore:
                 code=framing.take_str(envelope, "code", max_length=64, default=""),
                 why=framing.take_str(envelope, "why", default=""),
             )
-            self._tell(self.events.keys_told, told)
+            self.shell.tell(self.events.keys_told, told)
         elif kind == "objects_lost":
             if link.end.resumed:  # else all is told anyway
                 self.objects.lost()
         elif kind == "object_refused":
             code, why = framing.take_str(envelope, "code", max_length=64), framing.take_str(envelope, "why")
-            self._tell(self.events.object_refused, framing.take_str(envelope, "id", default=""), code, why)
+            self.shell.tell(self.events.object_refused, framing.take_str(envelope, "id", default=""), code, why)
         else:
             raise WireError(f"unknown control message {kind!r}")
 
