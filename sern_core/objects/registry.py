@@ -5,8 +5,8 @@ definition, attributes and a latest value, so that a twin, a remote ROS node and
 
 Theory of operation
 - `put`, `put_stream`, `delete` and `observe` each raise the registry's version by one and stamp the object with it.
-  `since(version)` lists what is newer: each changed object once, with its latest state, however often it changed.
-  Only deletions need a log; when it does not reach back far enough (or the reader comes from another epoch, that is
+  `since(version)` lists what is newer (`change_log`): each changed object once, with its latest state, however often it
+  changed. When the log of deletions does not reach back far enough (or the reader comes from another epoch, that is
   another run of the relay), the answer is the whole registry with `resync` set.
 - A value up to `max_value_bytes` is kept and shown. Of a larger one the object shows size and SHA-256: `observe` only
   keeps a reference to the body, which costs the hot path nothing, and the hash is worked out when somebody asks. When
@@ -21,16 +21,15 @@ Theory of operation
 """
 
 import hashlib
-import re
-from collections import OrderedDict, deque
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
-from operator import attrgetter
 from types import MappingProxyType
 from typing import Final
 
 from sern_core.bodies.codecs import Work, decode
-from sern_core.objects.values import Entry, ObjectLimits, ObjectValues
+from sern_core.objects.change_log import ChangeLog
+from sern_core.objects.object_limits import ObjectLimits
+from sern_core.objects.values import Entry, ObjectValues
 from sern_core.objects.xr_object import ChangedIds, ObjectChanges, XrObject
 from sern_core.vocabulary.codec_names import Codec
 from sern_core.vocabulary.errors import CodecError, RefusedError
@@ -48,7 +47,6 @@ COMMAND_OBJECT_TYPES: Final = COMMAND_TYPES | {
 TRANSFORM_TYPES: Final = frozenset({"tf2_msgs/TFMessage", "tf/tfMessage", "geometry_msgs/TransformStamped"})
 PATCH_TYPES: Final = frozenset({"map_msgs/OccupancyGridUpdate", "map_msgs/PointCloud2Update"})
 """A topic with one of these types, which change part of a map, is an object of kind `patch`."""
-_RESERVED: Final = re.compile(r".*@([a-z][a-z0-9_]{0,62})", re.DOTALL)
 
 
 def text_hash(definition: str) -> str:
@@ -92,17 +90,10 @@ class ObjectRegistry:
         """The largest value that is decoded where it is asked for; None: any."""
         self.on_deleted: Callable[[str], None] = lambda _object_id: None
         """Called when an object is gone; set by the owner."""
-        self._version = 0
-        self.described_version = 0
-        """The version of the last change of more than a value."""
         self._entries: dict[str, Entry] = {}
-        self._by_kind: dict[ObjectKind, OrderedDict[str, Entry]] = {  # least recently changed first
-            kind: OrderedDict() for kind in ObjectKind
-        }
+        self._log = ChangeLog(self._entries, epoch=epoch, deletions=self.limits.deletions)
         self._by_stream: dict[StreamId, Entry] = {}
         self._owned: dict[ClientName, set[str]] = {}
-        self._deletions: deque[tuple[int, str, ObjectKind]] = deque(maxlen=self.limits.deletions)
-        self._forgotten_version = 0  # deletions up to this version may have left the log
         self._bytes_of: dict[ClientName, list[int]] = {}  # of owners: their share of total and held bytes
 
     # Writing ---------------------------------------------------------------------------------------------------------
@@ -134,35 +125,32 @@ class ObjectRegistry:
         attribute_bytes = sum(_size_bytes(key) + _size_bytes(text) for key, text in fields.items())
         texts_bytes = _size_bytes(object_id) + _size_bytes(type_name) + _size_bytes(definition_hash)
         fixed_bytes = texts_bytes + definition_bytes + attribute_bytes
-        self._check(object_id, owner, definition_bytes, len(fields), attribute_bytes)
         entry = self._entries.get(object_id)
+        if entry is not None and entry.owner != owner:
+            raise RefusedError(
+                "not_owner", f"{owner} may not put {object_id[:80]}: {entry.owner} owns it; choose another id"
+            )
+        limits = self.limits
+        limits.check_id(object_id, owner)
+        limits.check_texts(object_id, owner, definition_bytes, len(fields), attribute_bytes)
+        if entry is None:
+            limits.check_count(object_id, owner, len(self._owned.get(owner, ())))
         old_bytes = 0 if entry is None else entry.fixed_bytes + (0 if value is None else self._values.kept_bytes(entry))
-        kept_bytes = 0 if value is None or len(value) > self.limits.max_value_bytes else len(value)
+        kept_bytes = 0 if value is None or len(value) > limits.max_value_bytes else len(value)
+        more_bytes = fixed_bytes + kept_bytes - old_bytes
         own_bytes = self._bytes_of.get(owner, (0, 0))[0]
-        for what, held_bytes, limit_bytes in (
-            (f"{owner}'s objects hold", own_bytes, self.limits.max_bytes_per_owner),
-            ("the registry holds", self._values.total_bytes, self.limits.max_total_bytes),
-        ):
-            if held_bytes - old_bytes + fixed_bytes + kept_bytes > limit_bytes:
-                raise RefusedError(
-                    "registry_full",
-                    f"{owner} may not put {object_id}: {what} {held_bytes} of {limit_bytes} bytes; "
-                    "delete objects or shorten definitions",
-                )
+        limits.check_room(object_id, owner, more_bytes, own_bytes=own_bytes, total_bytes=self._values.total_bytes)
         if entry is None:
             entry = Entry(object_id, owner, self._bytes_of.setdefault(owner, [0, 0]), now)
             self._entries[object_id] = entry
-            self._by_kind[entry.kind][object_id] = entry
+            self._log.add(entry)
             self._owned.setdefault(owner, set()).add(object_id)
         self._values.count(entry, fixed_bytes - entry.fixed_bytes)
         entry.fixed_bytes = fixed_bytes
         definition_hash = definition_hash or text_hash(definition)
         told = kind, type_name, definition, definition_hash, fields
         redescribed = not entry.version or entry.teller != teller or told != _description(entry)
-        if entry.kind is not kind:
-            del self._by_kind[entry.kind][object_id]
-            self._by_kind[kind][object_id] = entry
-            entry.kind = kind
+        self._log.set_kind(entry, kind)
         entry.type_name = type_name
         entry.definition = definition
         entry.definition_hash = definition_hash
@@ -173,9 +161,9 @@ class ObjectRegistry:
             entry.ros_stamp_ns = ros_stamp_ns
         entry.wall_ns = wall_ns
         entry.teller = teller
-        self._touch(entry, now)
+        self._log.touch(entry, now)
         if redescribed:
-            entry.described = self.described_version = entry.version
+            self._log.redescribed(entry)
         return self._seen(entry)
 
     def show(self, item: XrObject, *, teller: ClientName, redescribed: bool, now: float) -> None:
@@ -203,7 +191,7 @@ class ObjectRegistry:
             self._values.told(entry, item.value_bytes, item.value_sha256)
             entry.seq, entry.ros_stamp_ns = item.seq, item.ros_stamp_ns
         if redescribed:
-            entry.described = self.described_version = entry.version
+            self._log.redescribed(entry)
 
     def make_room(self, more_bytes: int) -> None:
         """Raise the limit of what all objects may hold: there is one more relay that tells of objects."""
@@ -251,8 +239,8 @@ class ObjectRegistry:
         """The text of a stream's definition is known now: whoever has its object is told anew."""
         entry = self._by_stream.get(stream)
         if entry is not None:
-            self._touch(entry, now)
-            entry.described = self.described_version = entry.version
+            self._log.touch(entry, now)
+            self._log.redescribed(entry)
 
     def observe(
         self,
@@ -280,7 +268,7 @@ class ObjectRegistry:
             entry.body, entry.sha256 = body, None  # of the same size: what the budgets hold stays
         else:
             self._values.keep(entry, body, codec)
-        self._touch(entry, now)
+        self._log.touch(entry, now)
         return True
 
     def delete(self, object_id: str, *, owner: ClientName) -> bool:
@@ -312,7 +300,12 @@ class ObjectRegistry:
 
     @property
     def version(self) -> int:
-        return self._version
+        return self._log.version
+
+    @property
+    def described_version(self) -> int:
+        """The version of the last change of more than a value."""
+        return self._log.described_version
 
     @property
     def total_bytes(self) -> int:
@@ -376,7 +369,7 @@ class ObjectRegistry:
         """What has to be done before the values of these objects, changed after `version`, can be told. Nothing while
         `inline_bytes` is None."""
         found: list[ValueRequest] = []
-        entries: Iterable[Entry] = reversed(self._newer(version, None if kind is None else (kind,)))
+        entries: Iterable[Entry] = reversed(self._log.newer(version, None if kind is None else (kind,)))
         if topic is not None:
             entries = [self._entries[object_id] for object_id in self.named(owner=owner, topic=topic)]
         for entry in entries:
@@ -414,36 +407,7 @@ class ObjectRegistry:
     ) -> ChangedIds:
         """`since` for who looks at the objects one by one later on, those of some kinds or all. One that is gone by
         then is among those deleted after the version given here; one that has changed is told again."""
-        foreign = version < 0 or version > self._version or (epoch is not None and epoch != self.epoch)
-        if foreign or (version and version < self._forgotten_version):
-            whole = tuple(entry.id for entry in self._newer(0, kinds))
-            return ChangedIds(self.epoch, self._version, True, whole, (), whole)
-        updated = self._newer(version, kinds)
-        gone: dict[str, int] = {}
-        for at, object_id, kind in reversed(self._deletions) if version else ():
-            if at <= version:
-                break
-            if object_id not in self._entries and (kinds is None or kind in kinds):
-                gone.setdefault(object_id, at)
-        ids = tuple(entry.id for entry in updated)
-        in_order = ids
-        if gone:
-            changes = [(entry.version, entry.id) for entry in updated] + [(at, each) for each, at in gone.items()]
-            in_order = tuple(object_id for _version, object_id in sorted(changes))
-        return ChangedIds(self.epoch, self._version, False, ids, tuple(reversed(gone)), in_order)
-
-    def _newer(self, version: int, kinds: Collection[ObjectKind] | None) -> list[Entry]:
-        """What has changed after a version, the oldest change first."""
-        found: list[Entry] = []
-        for kind, entries in self._by_kind.items():
-            if kinds is not None and kind not in kinds:
-                continue
-            for entry in reversed(entries.values()):
-                if entry.version <= version:
-                    break
-                found.append(entry)
-        found.sort(key=attrgetter("version"))
-        return found
+        return self._log.changed(version, epoch=epoch, kinds=kinds)
 
     def validate(self) -> None:
         """Check counts, sums and orders against the objects; raises AssertionError."""
@@ -458,66 +422,12 @@ class ObjectRegistry:
             assert own_bytes <= self.limits.max_bytes_per_owner, "an owner has too much"
             assert own_held_bytes <= self.limits.max_held_per_owner, "an owner holds too much"
         assert self._bytes_of.keys() == self._owned.keys(), "owners by bytes"
-        assert sum(map(len, self._by_kind.values())) == len(entries), "objects by kind"
-        for kind, some in self._by_kind.items():
-            versions = [entry.version for entry in some.values()]
-            assert all(entry.kind is kind and entries[entry.id] is entry for entry in some.values()), "a kind"
-            assert versions == sorted(set(versions)), "the order of changes"
-            assert not versions or versions[-1] <= self._version, "a version from the future"
-            assert all(entry.described <= self.described_version for entry in some.values()), "a later description"
+        self._log.validate()
         assert {entry.id for entry in entries.values()} == set().union(*self._owned.values()), "owners"
         assert all(self._owned.values()), "an owner of nothing"
         assert {entry.stream: entry for entry in entries.values() if entry.stream} == self._by_stream, "streams"
 
     # Internals -------------------------------------------------------------------------------------------------------
-
-    def _check(
-        self, object_id: str, owner: ClientName, definition_bytes: int, attributes: int, attribute_bytes: int
-    ) -> None:
-        limits = self.limits
-        entry = self._entries.get(object_id)
-        if entry is not None and entry.owner != owner:
-            raise RefusedError(
-                "not_owner", f"{owner} may not put {object_id[:80]}: {entry.owner} owns it; choose another id"
-            )
-        self.check_id(object_id, owner)
-        for what, size, limit in (
-            ("bytes of definition", definition_bytes, limits.max_definition_bytes),
-            ("attributes", attributes, limits.max_attributes),
-            ("bytes of attributes", attribute_bytes, limits.max_attribute_bytes),
-        ):
-            if size > limit:
-                raise RefusedError(
-                    "too_large", f"{owner} may not put {object_id[:80]}: {size} {what}; at most {limit} are taken"
-                )
-        if entry is None and len(self._owned.get(owner, ())) >= limits.max_objects_per_owner:
-            raise RefusedError(
-                "too_many_objects",
-                f"{owner} may not put {object_id[:80]}: it has {limits.max_objects_per_owner} objects, which is the "
-                "limit; delete some",
-            )
-
-    def check_id(self, object_id: str, owner: ClientName) -> None:
-        """Raises RefusedError for what is no id of an object, or one that is reserved for others."""
-        limits = self.limits
-        if not object_id or len(object_id) > limits.max_id_chars or not object_id.isprintable():
-            raise RefusedError(
-                "bad_id",
-                f"{owner} may not put {object_id[:80]!r}: an id has 1 to {limits.max_id_chars} printable characters",
-            )
-        reserved = _RESERVED.fullmatch(object_id)
-        if reserved is not None and reserved[1] != owner:
-            raise RefusedError(
-                "not_owner",
-                f"{owner} may not put {object_id[:80]}: ids that end in @{reserved[1]} belong to {reserved[1]}; "
-                "choose another id",
-            )
-
-    def _touch(self, entry: Entry, now: float) -> None:
-        self._version += 1
-        entry.version = self._version
-        entry.updated_s = now
-        self._by_kind[entry.kind].move_to_end(entry.id)
 
     def _delete(self, entry: Entry) -> None:
         self._values.forget(entry)
@@ -525,16 +435,11 @@ class ObjectRegistry:
         if entry.stream is not None:
             del self._by_stream[entry.stream]
         del self._entries[entry.id]
-        del self._by_kind[entry.kind][entry.id]
         owned = self._owned[entry.owner]
         owned.discard(entry.id)
         if not owned:
             del self._owned[entry.owner], self._bytes_of[entry.owner]
-        self._version += 1
-        self.described_version = self._version
-        if len(self._deletions) == self._deletions.maxlen:
-            self._forgotten_version = self._deletions[0][0] if self._deletions else self._version
-        self._deletions.append((self._version, entry.id, entry.kind))
+        self._log.deleted(entry)
         self.on_deleted(entry.id)
 
     def _is_long(self, entry: Entry) -> bool:

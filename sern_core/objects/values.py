@@ -6,32 +6,14 @@ held until somebody asks for it. What the budgets have no room for is told by it
 
 import hashlib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 
 from sern_core.bodies.codecs import decode, raw_size
+from sern_core.objects.object_limits import ObjectLimits
 from sern_core.vocabulary.codec_names import Codec
 from sern_core.vocabulary.errors import CodecError
 from sern_core.vocabulary.message import StreamId
 from sern_core.vocabulary.types import ClientName, ObjectKind
-
-
-@dataclass(frozen=True, slots=True)
-class ObjectLimits:
-    """What the registry holds; beyond it an owner is refused by name."""
-
-    max_objects_per_owner: int = 4_096
-    max_bytes_per_owner: int = 8 * 2**20  # of an owner's objects, as in max_total_bytes
-    max_held_per_owner: int = 16 * 2**20  # of an owner's objects, as in max_held_bytes
-    max_total_bytes: int = 64 * 2**20  # ids, type names, definitions, attributes and kept values
-    max_held_bytes: int = 64 * 2**20  # references to larger values
-    max_value_bytes: int = 4_096
-    max_decoded_bytes: int = 16 * 2**20  # of a value that came encoded, when somebody asks for it
-    max_definition_bytes: int = 256 * 2**10
-    max_attributes: int = 64
-    max_attribute_bytes: int = 4_096
-    max_id_chars: int = 512
-    deletions: int = 4_096  # length of the deletion log
 
 
 class Entry:

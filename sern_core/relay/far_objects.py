@@ -77,7 +77,7 @@ class FarObjects:
         if isinstance(change, Put):
             if not is_client_name(change.owner):
                 raise WireError(f"an object of {change.owner[:64]!r}, who is no client")
-            self._registry.check_id(change.object_id, ClientName(change.owner))
+            self._registry.limits.check_id(change.object_id, ClientName(change.owner))
         if isinstance(change, (Put, Set)):
             largest = self._registry.limits.max_value_bytes
             if change.value is not None and len(change.value) > largest:

@@ -12,7 +12,7 @@ from sern_client.endpoints.common import first_messages
 from sern_client.endpoints.ros1 import Ros1Options
 from sern_client.endpoints.ros1 import first_messages as ros1_first_messages
 from sern_core.link import control_stream, definitions
-from sern_core.objects.values import ObjectLimits
+from sern_core.objects.object_limits import ObjectLimits
 from sern_core.relay import absent, access, draining, far_objects, feed_owners, interest, peer_objects, routing
 from sern_core.site import peers
 from sern_core.stream import decoding, drop_reports, in_stream, latched, prices

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import pytest
 
 from sern_core.objects.changes import OBJECTS_TOPIC
-from sern_core.objects.values import ObjectLimits
+from sern_core.objects.object_limits import ObjectLimits
 from sern_core.objects.xr_object import XrObject
 from sern_core.relay.access import AccessRule, AccessTable
 from sern_core.relay.hub import HubParams

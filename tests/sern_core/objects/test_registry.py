@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
 
 from sern_core.bodies.codecs import SIZE, encode
+from sern_core.objects.object_limits import ObjectLimits
 from sern_core.objects.registry import ObjectRegistry, kind_of, topic_object_id
-from sern_core.objects.values import ObjectLimits
 from sern_core.objects.xr_object import object_to_json
 from sern_core.vocabulary.codec_names import Compression
 from sern_core.vocabulary.errors import RefusedError

@@ -29,11 +29,11 @@ STATIC = frozenset(
         ".clients.access._cache",  # decisions, at most CACHE_ENTRIES
         ".clients.access._grants",
         ".clients.access._grants[][]._exact",
-        ".objects._deletions",  # a ring
+        ".objects._log._deletions",  # a ring
         ".link.lanes.clock._stepped",  # a ring
         ".link.taking._had",  # where reliable streams ended: at most MAX_REMEMBERED
         ".exchange.counts",  # outcomes, of which there are eight
-        ".objects.registry._deletions",  # of a client's own
+        ".objects.registry._log._deletions",  # of a client's own
         ".presence._watchers[].missing",  # those that a client shows as gone, in its session: at most MAX_ASKED
         ".peers._ended",  # those of whom is shown that they are gone: at most MAX_GIVEN_UP, with MAX_ENDED topics each
         ".peers._ended[]",
