@@ -5,7 +5,6 @@ import json
 import logging
 import secrets
 import time
-from collections.abc import Sequence
 from contextlib import AsyncExitStack
 from functools import partial
 from pathlib import Path
@@ -14,22 +13,17 @@ from typing import TYPE_CHECKING, Final
 import zmq
 from prometheus_client import CollectorRegistry
 
-from sern_core.link.link import Link
 from sern_core.objects.feed import PERIOD_S
 from sern_core.relay.access import AccessTable
 from sern_core.relay.hub import Hub, HubParams
 from sern_core.relay.traces import Traces
-from sern_core.stream.out_channel import OutChannel
-from sern_core.topics.rules import FeedRole
 from sern_core.vocabulary.errors import ConfigError
-from sern_core.vocabulary.key_news import ClientKeys, KeyRevocation
-from sern_core.vocabulary.message import Message, StreamInfo
-from sern_core.vocabulary.names import PEER_SIGN, is_peer
-from sern_core.vocabulary.types import ClientName
 from sern_relay.admission import ZAP_DOMAIN, Admission, read_directory
 from sern_relay.comings import Comings
 from sern_relay.durable import DurableHolding
-from sern_relay.feed import RelayFeed
+from sern_relay.enforcement import Enforcement
+from sern_relay.feed_roles import FeedRoles
+from sern_relay.hub_news import HubNews
 from sern_relay.keyring import OwnKeys, RelayKeyring
 from sern_relay.readers import Readers
 from sern_relay.refusals import Refusals
@@ -37,7 +31,9 @@ from sern_relay.relay_metrics import register_relay
 from sern_relay.revocations import FabricRevocations
 from sern_relay.server import RelayServer
 from sern_relay.transforms import TransformObjects
+from sern_relay.transports import Transports
 from sern_relay.udp import RelayLanes
+from sern_relay.unconfirmed import wait_confirmed
 from sern_relay.views import RelayViews
 from sern_runtime import clock, ros_types
 from sern_runtime.adaptation import Adaptation
@@ -48,11 +44,9 @@ from sern_runtime.config.keys import KeyDirectory, fingerprint
 from sern_runtime.config.load import Loaded
 from sern_runtime.config.relay import RelayFile, load_relay
 from sern_runtime.datagram_watch import DatagramWatch
-from sern_runtime.draining import Progress
 from sern_runtime.durable.disk import Disk
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.events import EventLog
-from sern_runtime.fabric.port import FabricCounters
 from sern_runtime.http_routes import Health
 from sern_runtime.internal_errors import InternalErrors
 from sern_runtime.loop import Shutdown
@@ -69,20 +63,9 @@ if TYPE_CHECKING:
     from sern_relay.fabric import RelayFabric
     from sern_runtime.http import HttpServer
 
-PATIENCE_S: Final = 5.0
-"""How long a stopping relay waits for the next sign that what it holds for connected clients gets further."""
 SWEEP_S: Final = 1.0
 OTHER_FILES: Final = 128
 """What a relay has open beside the connections of clients."""
-RULES: Final = "rules"
-"""The kind of events of other relays' access rules."""
-OTHER_CODE: Final = "other"
-REFUSAL_CODES: Final = frozenset({
-    "bad_announcement", "bad_id", "bad_name", "bad_object", "bad_pattern", "displaced", "forbidden",
-    "bad_rules", "internal_error", "name_taken", "not_owner", "old_boot", "origin", "registry_full", "too_large",
-    "too_many_objects", "too_many_patterns", "too_many_rules", "too_many_streams", "type_mismatch",
-})  # fmt: skip
-"""What a refusal is counted under; a code that a client made up is counted as `other`."""
 
 _log = logging.getLogger(__name__)
 
@@ -104,13 +87,8 @@ async def run_relay(path: Path, shutdown: Shutdown) -> int:
     return 0
 
 
-def _unconfirmed(link: Link, channel: OutChannel, last: int) -> bool:
-    """Whether a connected client has yet to confirm messages up to `last`."""
-    return link.established and bool(channel.retained) and channel.retained[0].seq <= last
-
-
 class RelayDaemon:
-    """`start`, then any time, then `drain` and `stop`; `stop` alone is safe at any point. It is the hub's shell."""
+    """`start`, then any time, then `drain` and `stop`; `stop` alone is safe at any point."""
 
     def __init__(self, loaded: Loaded[RelayFile]) -> None:
         self.loaded = loaded
@@ -119,24 +97,10 @@ class RelayDaemon:
         self.admission = Admission(self._directory(loaded))
         self.errors = InternalErrors()
         self.collector = CollectorWatch()
-        self.refusals = dict.fromkeys((*sorted(REFUSAL_CODES), OTHER_CODE), 0)
         self.reloads = ReloadState()
         self.events = EventLog()
         self.turned_away = Refusals(self.events)
-        self.hub = Hub(
-            name=model.name,
-            boot=secrets.randbits(63),
-            access=AccessTable(model.access_rules()),
-            known=self.admission.known,
-            events=self,
-            link=model.link.params(),
-            scheduler=model.scheduler.params(),
-            params=HubParams(cache_bytes=model.replay.cache_bytes, resume_s=model.replay.resume_s),
-            wall_ns=lambda _now: time.time_ns(),
-            traces=Traces(),
-            now=clock.now(),
-        )
-        self.hub.after = self._after
+        self.transports = Transports()
         self.parts = OptionalParts(
             "adaptation",
             "codecs",
@@ -148,19 +112,54 @@ class RelayDaemon:
             "summary",
             "watching",
         )
+        self.codecs = CodecPool(after=self.transports.after, parts=self.parts)
+        self.coder = make_coder(model.link.params(), self.codecs)
+        self.readers = Readers(self.coder, self.parts, self.errors)
+        self._comings = Comings(
+            self.events, relay=model.name, remembered=self.admission.named, address=self.transports.address
+        )
+        self.news = HubNews(self._comings, self.readers, self.transports, self.events, self.errors)
+        self.hub = Hub(
+            name=model.name,
+            boot=secrets.randbits(63),
+            access=AccessTable(model.access_rules()),
+            known=self.admission.known,
+            events=self.news,
+            link=model.link.params(),
+            scheduler=model.scheduler.params(),
+            params=HubParams(cache_bytes=model.replay.cache_bytes, resume_s=model.replay.resume_s),
+            wall_ns=lambda _now: time.time_ns(),
+            traces=Traces(),
+            now=clock.now(),
+        )
+        self.hub.after = self.transports.after
         self.message_log: MessageLog | None = None
         if model.message_log:
             self.message_log = MessageLog(loaded.resolve(model.message_log), partial(self.parts.ended, "message_log"))
         self.fates: LoggedFates | None = None
         if self.message_log is not None:
             self.fates = self.hub.forwarding.fates = LoggedFates(self.message_log, self.parts)
-        self.codecs = CodecPool(after=self._after, parts=self.parts)
-        self.coder = make_coder(model.link.params(), self.codecs)
-        self.readers = Readers(self.coder, self.parts, self.errors)
-        self._comings = Comings(self.events, relay=model.name, remembered=self.admission.named, address=self._address)
-        self.revocations = FabricRevocations(self.hub, self.admission, self.events, enforce=self._enforce)
+        self.enforcement = Enforcement(self.hub, self.admission, self.transports, self.events)
+        self.revocations = self.news.revocations = FabricRevocations(
+            self.hub, self.admission, self.events, enforce=self.enforcement.enforce
+        )
+        self.feed_roles = FeedRoles(
+            loaded.path,
+            self.hub,
+            self.readers,
+            self.reloads,
+            in_force=self._in_force,
+            after=self.transports.after,
+            refused=self.news.refused,
+        )
         self.views = RelayViews(
-            model.name, self.hub, self._comings, self.turned_away, self.events, self.admission, self._address
+            model.name,
+            self.hub,
+            self._comings,
+            self.turned_away,
+            self.events,
+            self.admission,
+            self.transports.address,
         )
         self.adaptation: Adaptation | None = None
         if model.adaptation is not None:
@@ -169,7 +168,7 @@ class RelayDaemon:
                     model.adaptation,
                     lambda: list(self.hub.links.values()),
                     coder=None,
-                    kick=self._after,
+                    kick=self.transports.after,
                     parts=self.parts,
                 )
         self.durable: DurableHolding | None = None
@@ -178,21 +177,15 @@ class RelayDaemon:
                 Disk.within(loaded.resolve(model.durable.directory), max_bytes=model.durable.max_bytes, shared=True)
             )
         self.zap: ZapHandler | None = None
-        self.server: RelayServer | None = None
         self.keyring: RelayKeyring | None = None
-        self.lanes: RelayLanes | None = None
-        self.fabric: RelayFabric | None = None
         self.datagrams = DatagramWatch(
-            self.hub.clients.of_clients,
-            lambda link, within_s: self.lanes.problem(link, within_s) if self.lanes is not None else None,
-            lambda link: link.peer,
+            self.hub.clients.of_clients, self.transports.datagram_problem, lambda link: link.peer
         )
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
         self._http: HttpServer | None = None
         self.live: Live | None = None
         self.tasks: list[asyncio.Task[None]] = []
         self._ready = False
-        self._flush_due: asyncio.Handle | None = None
 
     @staticmethod
     def _directory(loaded: Loaded[RelayFile]) -> KeyDirectory | None:
@@ -200,7 +193,7 @@ class RelayDaemon:
         return read_directory(None if clients_dir is None else loaded.resolve(clients_dir))
 
     def _make_durable(self, disk: Disk) -> DurableHolding:
-        known, after = self.admission.known, self._after
+        known, after = self.admission.known, self.transports.after
         return DurableHolding(disk, self.hub, known=known, now=clock.now, after=after)
 
     def _make_fabric(self, section: FabricSection) -> "RelayFabric":
@@ -238,18 +231,18 @@ class RelayDaemon:
         if own is not None:
             self.zap = ZapHandler(self._ctx, refused=self.turned_away.refuse)
             self.zap.add_domain(ZAP_DOMAIN, self.admission.lookup)
-            self.keyring = RelayKeyring(
+            self.keyring = self.news.keyring = RelayKeyring(
                 self.hub,
                 self.admission,
                 own,
                 overlap_s=relay.overlap_s,
-                session_key=lambda client: self.server.session_key(client) if self.server is not None else None,
-                after=self._after,
-                relays=lambda: {} if self.fabric is None else self.fabric.reached(),
+                session_key=self.transports.session_key,
+                after=self.transports.after,
+                relays=self.transports.reached,
             )
         self.revocations.read()
         with blamed_on(self.loaded.path, "relay", "listen"):
-            self.server = RelayServer(
+            server = self.transports.server = RelayServer(
                 self._ctx,
                 self.hub,
                 relay.listen,
@@ -260,31 +253,30 @@ class RelayDaemon:
                 handshake_interval_s=relay.handshake_interval_s,
                 max_connections=relay.max_connections,
                 redundancy=model.link.redundancy,
-                after=self._after,
+                after=self.transports.after,
                 marks=model.link.dscp.marks(),
                 turned_away=self.turned_away.note,
             )
         if keys is not None and relay.udp:
             with blamed_on(self.loaded.path, "relay", "listen"):
-                self.lanes = RelayLanes(
+                self.transports.lanes = RelayLanes(
                     self.hub,
                     relay.listen,
-                    port_of=self.server.local_port,
-                    after=self._after,
+                    port_of=server.local_port,
+                    after=self.transports.after,
                     marks=model.link.dscp.marks(),
                 )
         if model.fabric is not None:
             with blamed_on(self.loaded.path, "fabric"):
-                self.fabric = self._make_fabric(model.fabric)
-                await self.fabric.start()
+                fabric = self.transports.fabric = self._make_fabric(model.fabric)
+                await fabric.start()
         if keys is not None and self.zap is not None:
             await self_test(self._ctx, self.zap, relay.listen, keys.public_key)
             _log.info("self-test passed: a stranger's key is refused on %s", ", ".join(relay.listen))
         else:
             _log.warning("insecure: true: clients are not authenticated and nothing is encrypted")
-        if model.feed.roles:
-            with blamed_on(self.loaded.path, "feed", "roles"):
-                self.readers.feed = self._make_feed(self._ctx, model.feed_roles())
+        with blamed_on(self.loaded.path, "feed", "roles"):
+            self.feed_roles.start(self._ctx, model.feed_roles())
         self.tasks.append(asyncio.create_task(self._tick(), name="relay-tick"))
         self.tasks.append(asyncio.create_task(self._tell_objects(), name="relay-objects"))
         if self.adaptation is not None:
@@ -299,50 +291,9 @@ class RelayDaemon:
             _log, logging.INFO, "started", "", "relay %s listens on %s", model.name, ", ".join(relay.listen)
         )
 
-    def _end_lapsed(self) -> None:
-        """Cut the connections that were made with a key that was taken away or has expired. A session that another
-        connection holds by now goes on. Whose those are that have not said anything yet is not known: they go, too."""
-        lapsed = self.admission.take_lapsed()
-        if not lapsed or self.server is None:
-            return
-        self.server.cut_unbound()
-        for client, keys in lapsed.items():
-            stays = self.server.session_key(client) in self.admission.valid().get(client, frozenset())
-            cut = self.server.cut_keys(client, keys) if stays else self.server.cut_client(client)
-            self.events.say(_log, logging.WARNING, "key_lost", client, "%s lost a key; %d connections cut", client, cut)
-            if not stays:
-                self.hub.clients.end_session(client, "the key no longer holds", now=clock.now())
-
-    def _enforce(self) -> None:
-        """End what was made with keys, or under names, that hold no more."""
-        if self.server is not None:
-            self.server.cut_unbound()  # admitted by the old keys, and silent so far
-        self._end_lapsed()
-        for client in [name for name in self.hub.links if not (is_peer(name) or self.admission.known(name))]:
-            self.events.say(
-                _log, logging.WARNING, "key_lost", client,
-                "%s is in the directory no more; what was held for it is dropped", client,
-            )  # fmt: skip
-            self.hub.forget(client, "the name is revoked", now=clock.now())
-        self._after()
-
-    def _after(self) -> None:
-        """Something came in: before the loop comes round again, whoever has something to send sends it."""
-        if self._flush_due is None:
-            self._flush_due = asyncio.get_running_loop().call_soon(self._flush)
-
-    def _flush(self) -> None:
-        self._flush_due = None
-        # All are kicked before any sends: the lanes of a link share one sign that there is something to send.
-        if self.lanes is not None:  # first: where there is one it has the messages
-            self.lanes.flush()
-        if self.server is not None:
-            self.server.flush()
-        if self.fabric is not None:
-            self.fabric.flush()
-
     async def _tick(self) -> None:
-        progress = {"socket": lambda: self.server.socket.drains if self.server else 0}
+        transports = self.transports
+        progress = {"socket": lambda: transports.server.socket.drains if transports.server else 0}
         if self.zap is not None:
             progress["zap"] = lambda: self.zap.counters.pings if self.zap else 0
             self.zap.ping()  # answered by the first sweep, which would else take it for stuck
@@ -352,27 +303,22 @@ class RelayDaemon:
         watchdog = Watchdog(self.notifier, progress)
         while True:
             await asyncio.sleep(SWEEP_S)
-            self._end_lapsed()
+            self.enforcement.end_lapsed()
             now = clock.now()
             self.hub.sweep(now=now)
             more = True
             while more:  # the others have their turns in between
                 await asyncio.sleep(0)
                 more = self.hub.lapse(now=clock.now())
-            if self.server is not None:
-                self.server.look()
+            if transports.server is not None:
+                transports.server.look()
             self.datagrams.tick()
             if self.message_log is not None:
                 with self.parts.survive("message_log"):
                     self.message_log.flush()
-            if self.readers.feed is not None:
-                with self.parts.survive("feed"):
-                    self.readers.feed.sweep(now=now)
-                    self._retry_feed(now)
-                    if self.readers.feed.over:
-                        feed, self.readers.feed = self.readers.feed, None
-                        feed.close()
-            self._flush()
+            with self.parts.survive("feed"):
+                self.feed_roles.look(now=now)
+            transports.flush()
             if self.zap is not None:
                 self.zap.ping()
             if watchdog.interval_s is not None:
@@ -395,24 +341,9 @@ class RelayDaemon:
         """What `/readyz` says."""
         return Health(ok=self._ready, reason=self.reloads.beside("listening" if self._ready else "starting"))
 
-    def _address(self, client: ClientName) -> str:
-        """Where a client comes from now; empty: it has no connection."""
-        by_tcp = self.server.address(client) if self.server is not None else ""
-        return by_tcp or (self.lanes.address(client) if self.lanes is not None else "")
-
     def clients_up(self) -> int:
         """Clients with a session."""
         return sum(link.established for link in self.hub.clients.of_clients())
-
-    @property
-    def fabric_counters(self) -> FabricCounters | None:
-        """The counters of the port to other relays; None: it is not there yet."""
-        return None if self.fabric is None else self.fabric.port.counters
-
-    @property
-    def relays(self) -> "RelayFabric | None":
-        """Other relays; None: there is no fabric, or not yet."""
-        return self.fabric
 
     @property
     def takeovers(self) -> int:
@@ -441,10 +372,10 @@ class RelayDaemon:
         now = clock.now()
         self.hub.revoke(access, now=now)
         with self.parts.survive("feed"):
-            self._update_feed(loaded.model, now)
+            self.feed_roles.use(loaded.model.feed_roles(), now=now)
         if own is not None:
             self._use_keys(own, loaded.model)
-        self._enforce()
+        self.enforcement.enforce()
         self.notifier.ready(self._status())
         self._in_force(now)
         words = "reloaded keys, access rules and feed roles; other changes need a restart"
@@ -452,10 +383,10 @@ class RelayDaemon:
 
     def _use_keys(self, own: OwnKeys, model: RelayFile) -> None:
         """What the relay proves itself with from now on, and what clients are told of it."""
-        if self.keyring is None or self.server is None:
+        if self.keyring is None or self.transports.server is None:
             return
         if own.now != self.keyring.own.now:
-            self.server.rekey(own.now, ZAP_DOMAIN)
+            self.transports.server.rekey(own.now, ZAP_DOMAIN)
             _log.warning("the relay has a new key, %s: clients connect anew", fingerprint(own.now.public_key))
         self.keyring.use(own, overlap_s=model.relay.overlap_s)
 
@@ -488,56 +419,13 @@ class RelayDaemon:
         add_page(server, self.live, metrics)
         return server
 
-    def _make_feed(self, ctx: "zmq.Context[zmq.Socket[bytes]]", roles: tuple[FeedRole, ...]) -> RelayFeed:
-        return RelayFeed(ctx, self.hub, roles, after=self._after, refused=self.refused)
-
-    def _update_feed(self, model: RelayFile, now: float) -> None:
-        """Make the feed's roles those of `model`. The first one brings the feed; it goes soon after the last one."""
-        roles = model.feed_roles()
-        if self.readers.feed is None:
-            if not roles or self._ctx is None:
-                return
-            self.readers.feed = self._make_feed(self._ctx, ())  # then as any other: what can be had is in force
-        try:
-            self.readers.feed.update(roles, now=now)
-        except ConfigError as error:
-            self.reloads.failed_in_part("feed.roles", str(error), now=now)
-            _log.error("%s: feed.roles: not all of them are in force: %s", self.loaded.path, error)
-
-    def _retry_feed(self, now: float) -> None:
-        """What was in use at a reload may be free by now; that it was not has been said and counted."""
-        if self.readers.feed is not None and self.readers.feed.feed.missing and self.readers.feed.open_missing():
-            self.reloads.part_in_force()
-            self._in_force(now)
-
     async def drain(self) -> None:
         """Go on with what connected clients have not confirmed while that gets anywhere, then end their sessions."""
-        now = clock.now()
-        progress = Progress()
-        give_up_s = now + self.loaded.model.link.drain_s
-        # What comes in from now on its sources keep until the next relay confirms it.
-        unconfirmed = [
-            (link, channel, channel.next_seq - 1)
-            for link in self.hub.links.values()
-            for channel in link.sender.channels.values()
-            if channel.retained
-        ]
-        while now < give_up_s:
-            unconfirmed = [item for item in unconfirmed if _unconfirmed(*item)]
-            if not unconfirmed:
-                break
-            left = (
-                sum(len(channel.retained) for _link, channel, _last in unconfirmed),
-                sum(nbytes for link in self.hub.links.values() for _messages, nbytes in link.sender.queued().values()),
-            )
-            if progress.still_s(left, now=now) > PATIENCE_S:
-                break
-            await asyncio.sleep(0.02)
-            now = clock.now()
+        await wait_confirmed(self.hub.links, limit_s=self.loaded.model.link.drain_s)
         for link in self.hub.links.values():
             link.close("relay stops", now=clock.now())
-        if self.server is not None:
-            self.server.run_all()
+        if self.transports.server is not None:
+            self.transports.server.run_all()
             await asyncio.sleep(0.05)  # libzmq's thread takes it from here
 
     async def stop(self) -> None:
@@ -553,7 +441,7 @@ class RelayDaemon:
                 stack.callback(self.fates.all_held, self.hub.links.values())
             if self._ctx is not None:
                 stack.callback(self._ctx.destroy, linger=0)
-            for part in (self.zap, self.server, self.lanes, self.readers):
+            for part in (self.zap, self.transports.server, self.transports.lanes, self.readers):
                 if part is not None:
                     stack.callback(part.close)
             if self._http is not None:
@@ -567,14 +455,10 @@ class RelayDaemon:
             if self.keyring is not None:
                 stack.push_async_callback(self.keyring.close)
             stack.push_async_callback(self.revocations.close)
-            if self.fabric is not None:
-                stack.push_async_callback(self.fabric.close)
-            stack.callback(self._cancel_flush)
+            if self.transports.fabric is not None:
+                stack.push_async_callback(self.transports.fabric.close)
+            stack.callback(self.transports.cancel)
             stack.push_async_callback(end_tasks, self.tasks)
-
-    def _cancel_flush(self) -> None:
-        if self._flush_due is not None:
-            self._flush_due.cancel()
 
     def _write_summary(self) -> None:
         name = self.loaded.model.summary
@@ -585,67 +469,3 @@ class RelayDaemon:
             path.write_text(json.dumps({"relay": self.loaded.model.name, **self.views.topics()}, indent=1) + "\n")
         except OSError as error:
             _log.error("%s: the summary could not be written: %s", path, error.strerror)
-
-    # --- HubEvents ----------------------------------------------------------------------------------------------------
-
-    def client_up(self, client: ClientName, *, resumed: bool) -> None:
-        self._comings.up(client, resumed=resumed)
-
-    def lane_asked(self, client: ClientName, ciphers: list[str]) -> None:
-        if self.lanes is not None:
-            self.lanes.asked(client, ciphers)
-
-    def lane_closed(self, client: ClientName) -> None:
-        if self.lanes is not None:
-            self.lanes.closed(client)
-
-    def keys_asked(self, client: ClientName) -> None:
-        if self.keyring is not None:
-            self.keyring.asked(client)
-
-    def keys_told(self, client: ClientName, keys: ClientKeys) -> None:
-        if self.keyring is not None:
-            self.keyring.told(client, keys)
-
-    def fault(self, client: ClientName | None, error: Exception) -> None:
-        self.errors.core(error, client or "")
-
-    def peer_up(self, peer: ClientName) -> None:
-        _log.info("connected to the relay %s", peer.removeprefix(PEER_SIGN))
-
-    def peer_down(self, peer: ClientName, reason: str) -> None:
-        _log.warning("not connected to the relay %s: %s", peer.removeprefix(PEER_SIGN), reason)
-
-    def went_over(self, client: ClientName, peer: ClientName, *, came: bool) -> None:
-        self._comings.went_over(client, peer.removeprefix(PEER_SIGN), came=came)
-
-    def revoked(self, peer: ClientName, revocations: Sequence[KeyRevocation]) -> None:
-        self.revocations.told(peer, revocations)
-
-    def rules_compared(self, peer: ClientName, *, same: bool) -> None:
-        relay = peer.removeprefix(PEER_SIGN)
-        if same:
-            self.events.say(_log, logging.INFO, RULES, relay, "the relay %s has the access rules of this one", relay)
-        else:
-            words = "the relay %s has other access rules than this one: what goes between them both must grant"
-            self.events.say(_log, logging.WARNING, RULES, relay, words, relay)
-
-    def client_down(self, client: ClientName, reason: str) -> None:
-        self._comings.down(client, reason)
-        if self.keyring is not None:
-            self.keyring.left(client)
-
-    def stream_added(self, stream: StreamInfo) -> None:
-        _log.info("%s announces %s (%s)", stream.id.origin, stream.id.topic, stream.info.type_name)
-        self.readers.owners_changed()
-
-    def stream_removed(self, stream: StreamInfo) -> None:
-        _log.info("%s of %s has ended", stream.id.topic, stream.id.origin)
-        self.readers.stream_removed(stream)
-
-    def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
-        self.readers.message(stream, message, now=now)
-
-    def refused(self, client: ClientName, code: str, text: str) -> None:
-        self.refusals[code if code in REFUSAL_CODES else OTHER_CODE] += 1
-        self._comings.refused(client, code, text)

@@ -1,25 +1,24 @@
 """The metrics of a relay: read at scrape from whoever counts."""
 
-from collections.abc import Mapping
 from typing import Protocol
 
 from sern_core.bodies.codecs import Coder
 from sern_core.relay.hub import Hub
 from sern_relay.durable import DurableHolding
-from sern_relay.fabric_metrics import Relays, register_relays
+from sern_relay.fabric_metrics import register_relays
 from sern_relay.feed import RelayFeed
+from sern_relay.hub_news import HubNews
 from sern_relay.keyring import RelayKeyring
 from sern_relay.readers import Readers
 from sern_relay.revocations import FabricRevocations
 from sern_relay.server import RelayServer
 from sern_relay.transforms import TransformObjects
-from sern_relay.udp import RelayLanes
+from sern_relay.transports import Transports
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.collector import CollectorWatch
 from sern_runtime.datagram_watch import DatagramWatch
 from sern_runtime.durable.durable_metrics import register_durable
 from sern_runtime.fabric.metrics import register_fabric
-from sern_runtime.fabric.port import FabricCounters
 from sern_runtime.internal_errors import InternalErrors
 from sern_runtime.link_metrics import register_codecs, register_links, register_received
 from sern_runtime.metrics import Metrics
@@ -38,26 +37,14 @@ class Counting(Protocol):
     collector: CollectorWatch
     parts: OptionalParts
     adaptation: Adaptation | None
-    server: RelayServer | None
-    lanes: RelayLanes | None
+    transports: Transports
+    news: HubNews
     zap: ZapHandler | None
     keyring: RelayKeyring | None
     readers: Readers
     reloads: ReloadState
     durable: DurableHolding | None
     revocations: FabricRevocations
-
-    @property
-    def refusals(self) -> Mapping[str, int]:
-        """Refusals by code."""
-
-    @property
-    def fabric_counters(self) -> FabricCounters | None:
-        """The counters of the port to other relays; None: it is not there yet."""
-
-    @property
-    def relays(self) -> Relays | None:
-        """Other relays; None: there is no fabric, or not yet."""
 
     @property
     def takeovers(self) -> int:
@@ -79,8 +66,8 @@ def register_relay(metrics: Metrics, relay: Counting, *, fabric: bool = False) -
     relay.collector.register(metrics)
     relay.parts.register(metrics)
     if fabric:
-        register_fabric(metrics, lambda: relay.fabric_counters)
-        register_relays(metrics, lambda: relay.relays, relay.revocations, lambda: hub.revocations.left_out)
+        register_fabric(metrics, lambda: relay.transports.fabric_counters)
+        register_relays(metrics, lambda: relay.transports.fabric, relay.revocations, lambda: hub.revocations.left_out)
     if relay.adaptation is not None:
         relay.adaptation.register(metrics)
     metrics.gauge("sern_relay_clients", "Clients with a session.",
@@ -98,7 +85,7 @@ def register_relay(metrics: Metrics, relay: Counting, *, fabric: bool = False) -
     metrics.gauge("sern_objects_untold", "Objects that subscribers were not told of: their texts fit into no message.",
                   read=lambda: [((), float(sum(feed.untold for feed in hub.exchange.every_feed())))])  # fmt: skip
     metrics.counter("sern_relay_refusals_total", "Announcements, subscriptions and objects refused, by code.",
-                    ("code",), lambda: [((code,), float(n)) for code, n in relay.refusals.items()])  # fmt: skip
+                    ("code",), lambda: [((code,), float(n)) for code, n in relay.news.refusals.items()])  # fmt: skip
     metrics.counter("sern_bad_frames_total", "Frames that were not valid; their connections were closed.",
                     read=lambda: [((), float(_bad_frames(relay)))])  # fmt: skip
     metrics.counter("sern_relay_auth_total", "Answers of the ZAP handler.", ("result",),
@@ -106,9 +93,9 @@ def register_relay(metrics: Metrics, relay: Counting, *, fabric: bool = False) -
     metrics.counter("sern_relay_new_keys_total", "Further keys that clients have offered for themselves.", ("result",),
                     lambda: _new_keys(relay.keyring))  # fmt: skip
     metrics.gauge("sern_relay_connections", "Connections, those without a proven key included.",
-                  read=lambda: [((), float(len(relay.server.connections) if relay.server else 0))])  # fmt: skip
+                  read=lambda: [((), float(_connections(relay.transports.server)))])  # fmt: skip
     metrics.counter("sern_relay_connections_refused_total", "Connections or messages refused, by reason.",
-                    ("reason",), lambda: refused_connections(relay.server))  # fmt: skip
+                    ("reason",), lambda: refused_connections(relay.transports.server))  # fmt: skip
     metrics.counter("sern_relay_replay_evicted_total", "Latched messages let go because of their bounds.",
                     read=lambda: [((), float(hub.streams.replays.evicted))])  # fmt: skip
     metrics.gauge("sern_relay_replay_bytes", "Latched messages kept for late joiners, bytes.",
@@ -125,7 +112,11 @@ def register_relay(metrics: Metrics, relay: Counting, *, fabric: bool = False) -
 
 def _bad_frames(relay: Counting) -> int:
     """Those on every lane."""
-    return sum(part.bad_frames for part in (relay.server, relay.lanes) if part is not None)
+    return sum(part.bad_frames for part in (relay.transports.server, relay.transports.lanes) if part is not None)
+
+
+def _connections(server: RelayServer | None) -> int:
+    return 0 if server is None else len(server.connections)
 
 
 def _auth(zap: ZapHandler | None) -> list[tuple[tuple[str, ...], float]]:

@@ -21,7 +21,7 @@ DEAD_ENDS = {"kind": "synthetic", "role": "robot", "topics": 1}
 async def datagrams_at(port: int, robot: ClientDaemon, relay: RelayDaemon) -> None:
     """Wait until the robot and the relay use datagrams, which go to `port` there."""
     name = ClientName(robot.loaded.model.client.name)
-    link, lanes = relay.hub.links[name], relay.lanes
+    link, lanes = relay.hub.links[name], relay.transports.lanes
     assert lanes is not None
     await until(lambda: name in lanes._lanes, f"{name} is offered a lane")
     session, _ = lanes._lanes[name]
@@ -74,7 +74,7 @@ async def test_a_client_has_its_lanes_where_it_reaches_the_relay(
     async with Lab(tmp_path, *endpoints) as lab:
         there = [address.format(*ports, path=tmp_path) for address in listen]
         relay = await lab.relay(lab.relay_file(relay={"listen": there}))
-        assert relay.server is not None and relay.lanes is not None
+        assert relay.transports.server is not None and relay.transports.lanes is not None
         revoked, stay = {}, {}
         for name, endpoint in endpoints.items():
             robot = await lab.connected(lab.client_file(name, DEAD_ENDS, relay={"endpoint": endpoint}))
@@ -85,14 +85,14 @@ async def test_a_client_has_its_lanes_where_it_reaches_the_relay(
             revoked[name] = robot
             home = "::1" if "[::1]" in endpoint else "127.0.0.1"
             assert f"{name} is reached over UDP at {home}" in caplog.messages
-            connected = relay.server.connections.handles_of(name)
+            connected = relay.transports.server.connections.handles_of(name)
             assert {(handle.local[0], handle.peer[0]) for handle in connected} == {(home, home)}
         assert relay.hub.links.keys() == endpoints.keys()
-        assert relay.lanes._lanes.keys() == revoked.keys()
+        assert relay.transports.lanes._lanes.keys() == revoked.keys()
         for name in revoked:
             (lab.clients_dir / f"{name}.pub").unlink()
         relay.reload()
-        assert relay.hub.links.keys() == stay.keys() and not relay.lanes._lanes
+        assert relay.hub.links.keys() == stay.keys() and not relay.transports.lanes._lanes
         for name, robot in revoked.items():
             await until(partial(refused, robot), f"{name} has no session, and knows why")
         for robot in stay.values():
@@ -110,7 +110,7 @@ async def test_a_lane_that_is_renewed_while_tcp_is_lost_keeps_its_port(tmp_path:
         relay = await lab.relay(lab.relay_file(relay={"listen": listen}))
         robot = await lab.connected(lab.client_file("robot1", DEAD_ENDS, relay={"endpoint": listen[1]}))
         await datagrams_at(ports[1], robot, relay)
-        name, lanes, server = ClientName("robot1"), relay.lanes, relay.server
+        name, lanes, server = ClientName("robot1"), relay.transports.lanes, relay.transports.server
         assert lanes is not None and server is not None
         session, _ = lanes._lanes[name]
         assert server.local_port(name) == ports[1]
@@ -128,7 +128,7 @@ async def test_over_ipc_there_is_no_datagram_lane(tmp_path: Path, caplog: pytest
     async with Lab(tmp_path, "robot1") as lab:
         relay = await lab.relay(lab.relay_file(relay={"listen": [endpoint]}))
         robot = await lab.connected(lab.client_file("robot1", DEAD_ENDS, relay={"endpoint": endpoint}))
-        name, lanes = ClientName("robot1"), relay.lanes
+        name, lanes = ClientName("robot1"), relay.transports.lanes
         assert lanes is not None and not lanes.server.ports
         assert robot.connection.lane is None, "it asks for none"
         lanes.asked(name, offered_ciphers())

@@ -150,12 +150,12 @@ async def test_sockets_are_read_in_batches_and_never_by_the_safety_tick_alone(tm
     bag = write_bag(tmp_path / "run.bag", {"/chat": 3000})
     async with Lab(tmp_path, "robot1", "site") as lab:
         relay = await lab.relay()
-        assert relay.server is not None
+        assert relay.transports.server is not None
         site = await lab.connected(lab.recorder_file("site", "/.*"))
         robot = await lab.connected(lab.player_file("robot1", bag))
         await until(lambda: delivered(site) == 3000)
         # Many small messages share a datagram, and many datagrams a look at the socket.
-        assert relay.server.socket.messages < 3000
+        assert relay.transports.server.socket.messages < 3000
         for daemon in (robot, site, relay):
             await lab.end(daemon)
 

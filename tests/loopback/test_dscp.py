@@ -212,7 +212,7 @@ async def marks_by_class(robot: ClientDaemon, relay: RelayDaemon, tap: Tap | Cap
         robot.core.send(channels[priority], body, 0, now=clock.now())
         hub.local.inject(down[priority], body, 0, now=clock.now())
         robot.connection.wake()
-        relay._after()
+        relay.transports.after()
         return all(sum(size > least for _, size in way) >= 40 for way in (tap.up, tap.down))
 
     def quiet() -> bool:
@@ -331,7 +331,7 @@ async def test_connections_have_the_marks_of_the_file(tmp_path: Path) -> None:
         lane = robot.connection.priority_lane
         assert lane is not None
         await until(lambda: len(lane.paths) == CONNECTIONS, "all are joined")
-        server = relay.server
+        server = relay.transports.server
         assert server is not None
         await until(lambda: len(server.priority_lanes.joined) == CONNECTIONS, "the relay knows that they are")
         marked = []

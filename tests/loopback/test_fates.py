@@ -48,7 +48,7 @@ async def test_every_message_has_one_fate_whatever_is_cut(tmp_path: Path) -> Non
         relay = await lab.relay(files[RELAY])
         site = await lab.connected(files[SITE])
         robot = await lab.connected(files[ROBOT])
-        assert relay.server is not None
+        assert relay.transports.server is not None
         for client in (ROBOT, SITE, ROBOT):
             poses, commands = delivered(site, POSE_TOPIC), delivered(robot, COMMAND_TOPIC)
             await until(lambda poses=poses: delivered(site, POSE_TOPIC) > poses + 20, "poses arrive")  # type: ignore[misc]
@@ -56,7 +56,7 @@ async def test_every_message_has_one_fate_whatever_is_cut(tmp_path: Path) -> Non
                 lambda commands=commands: delivered(robot, COMMAND_TOPIC) > commands,  # type: ignore[misc]
                 "commands arrive",
             )
-            relay.server.cut_client(ClientName(client))
+            relay.transports.server.cut_client(ClientName(client))
         poses = delivered(site, POSE_TOPIC)
         await until(lambda: delivered(site, POSE_TOPIC) > poses + 20, "poses arrive")
         for daemon in (robot, site, relay):

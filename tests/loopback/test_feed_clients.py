@@ -200,7 +200,7 @@ async def test_a_name_that_a_client_owns_is_refused(tmp_path: Path, programs: Pr
         for _ in range(3):
             send(publisher, CMD, TWIST.pack(*[0.0] * 6))
         await until(lambda: feed_of(relay).feed.counters()["unity"].forbidden == 3, "refused")
-        assert {code: count for code, count in relay.refusals.items() if count} == {"name_taken": 1}
+        assert {code: count for code, count in relay.news.refusals.items() if count} == {"name_taken": 1}
         assert counters(relay).injected == 0
         assert relay.hub.routing.owners(CMD) == ("jackal1",)
 

@@ -169,7 +169,7 @@ async def test_an_endpoint_that_is_in_use_is_taken_when_it_is_free(
             assert relay.readers.feed is not None
             assert list(relay.readers.feed.feed.endpoints()) == ["other"], "what can be had is in force"
             for _ in range(3):
-                relay._retry_feed(clock.now())
+                relay.feed_roles.look(now=clock.now())
             assert list(relay.readers.feed.feed.endpoints()) == ["other"]
             assert "not all of feed.roles are in force" in relay._status()
         await comes(programs.subscriber(b""), FRAME)

@@ -152,7 +152,7 @@ async def test_a_relay_listens_with_its_new_key_wherever_it_did(tmp_path: Path, 
         relay = await lab.relay(lab.relay_file(relay={"listen": [listen.format(lab.port)]}))
         if listen.startswith("ipc"):
             lab.endpoint = f"ipc://{tmp_path}/relay.ipc"
-        assert relay.server is not None
+        assert relay.transports.server is not None
         robot = await lab.connected(lab.client_file("robot1", DEAD_ENDS))
         old = load_public(tmp_path / "relay.pub").keys[0].key
         new = lab.make_relay_keys()  # the robot reads it when it is told to, as if it were given the file
@@ -162,7 +162,7 @@ async def test_a_relay_listens_with_its_new_key_wherever_it_did(tmp_path: Path, 
         relay.reload()
         keyring = robot.relays.current.keyring
         await until(lambda: keyring is not None and keyring.server_keys == (new.public_key,))
-        await until(lambda: relay.server is not None and relay.server.session_key(ROBOT) is not None, "it is back")
+        await until(lambda: relay.transports.session_key(ROBOT) is not None, "it is back")
         await lab.end(robot)
         await lab.end(relay)
 

@@ -41,18 +41,18 @@ async def test_a_replaced_key_is_cut_off_over_ipc_and_comes_back_when_it_is_put_
     async with Lab(tmp_path, "robot1") as lab:
         local(lab)
         relay = await lab.relay()
-        assert relay.server is not None and relay.zap is not None
+        assert relay.transports.server is not None and relay.zap is not None
         robot = await lab.connected(lab.client_file("robot1", DEAD_ENDS))
         public = lab.clients_dir / "robot1.pub"
         old = public.read_text()
         another = PublicKey(generate(ClientName("robot1")).public_key)
         write_public(public, PublicKeys(ClientName("robot1"), (another,)), replace=True)
         relay.reload()
-        assert list(relay.server.clients.sessions()) == []
+        assert list(relay.transports.server.clients.sessions()) == []
         await until(lambda: "refused our key" in robot.news.reason)
         refused = relay.zap.counters.unknown_key
         await until(lambda: relay.zap is not None and relay.zap.counters.unknown_key > refused, "it tries again")
-        assert list(relay.server.clients.sessions()) == [] and not robot.core.link.established
+        assert list(relay.transports.server.clients.sessions()) == [] and not robot.core.link.established
         assert caplog.text.count("robot1 lost a key; 1 connections cut") == 1
         public.write_text(old)
         relay.reload()
@@ -77,8 +77,8 @@ async def test_a_connection_that_outlives_its_key_is_not_heard(
         if ipc:
             local(lab)
         relay = await lab.relay()
-        assert relay.server is not None
-        server = relay.server
+        assert relay.transports.server is not None
+        server = relay.transports.server
         async with Stranger(lab, load_secret(tmp_path / "robot2.key")) as silent:
             await until(lambda: zmq.Event.HANDSHAKE_SUCCEEDED in silent.events, "admitted by its key, that holds")
             with monkeypatch.context() as patch:

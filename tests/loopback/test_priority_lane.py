@@ -32,8 +32,8 @@ def uses_priority_lane(robot: ClientDaemon, relay: RelayDaemon) -> bool:
 
 def joined(relay: RelayDaemon, client: str = ROBOT) -> list[int]:
     """File descriptors of the client's connections for class control."""
-    assert relay.server is not None
-    return [each.fd for each in relay.server.priority_lanes.joined if each.client == client]
+    assert relay.transports.server is not None
+    return [each.fd for each in relay.transports.server.priority_lanes.joined if each.client == client]
 
 
 @pytest.mark.parametrize("secure", [True, False], ids=["keys", "insecure"])
@@ -45,7 +45,7 @@ async def test_commands_arrive_over_it_whatever_becomes_of_its_connections(tmp_p
         robot = await lab.client(player(lab, bag))
         await until(lambda: uses_priority_lane(robot, relay) and delivered(site) > 100, "class control goes there")
         assert len(joined(relay)) == CONNECTIONS
-        server = relay.server
+        server = relay.transports.server
         assert server is not None
         for fd in joined(relay):
             connection = server.connections.by_fd(fd)

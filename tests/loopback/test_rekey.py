@@ -48,12 +48,12 @@ class Traffic:
                 self.site.core.send(self._channel, BODY, 0, now=now)
             else:
                 self.relay.hub.local.inject(self._handle, BODY, 0, now=now)
-        self.relay._after()
+        self.relay.transports.after()
         self.site.connection.wake()
 
     def sessions(self) -> set[int]:
         """The datagram sessions that carry data now, by their number."""
-        lanes = self.relay.lanes
+        lanes = self.relay.transports.lanes
         on_it = self.site.core.link.lane.id == LANE_UDP and self.relay.hub.links[SITE].lane.id == LANE_UDP
         return {lanes._lanes[SITE][0].id} if lanes is not None and on_it and SITE in lanes._lanes else set()
 
@@ -91,11 +91,11 @@ async def test_a_lane_that_the_relay_gave_up_is_asked_for_again(
         relay = await lab.relay()
         site = await lab.connected(lab.client_file("site", {"kind": "synthetic", "role": "operator"}))
         traffic = Traffic(relay, site, down=True)
-        assert relay.lanes is not None and site.connection.lane is not None
+        assert relay.transports.lanes is not None and site.connection.lane is not None
         for _ in range(2):
             await until(traffic.sessions)
-            session = relay.lanes._lanes[SITE][0]
-            relay.lanes._gone(SITE, session)
+            session = relay.transports.lanes._lanes[SITE][0]
+            relay.transports.lanes._gone(SITE, session)
             await until(lambda old=session.id: traffic.sessions() - {old})  # type: ignore[misc]
         lane = site.connection.lane
         # `ask_s` is None also while an answer is awaited; only a lane that works makes the pause short again.

@@ -105,7 +105,7 @@ async def test_two_processes_with_one_name_are_told_of_each_other(
         own = [record for record in caplog.records if said in record.getMessage()]
         assert {record.name for record in own} == {"sern_client.link_news", "sern_relay.comings"}
         at_relay = [record for record in own if record.name == "sern_relay.comings"]
-        assert relay.refusals["displaced"] == len(at_relay) >= 2
+        assert relay.news.refusals["displaced"] == len(at_relay) >= 2
         assert at_relay[0].getMessage().endswith(" has no session any more")
         assert not any(record.levelname == "ERROR" for record in caplog.records)
 
@@ -116,8 +116,8 @@ async def test_a_recovery_is_said_like_the_loss(tmp_path: Path, caplog: pytest.L
         relay = await lab.relay()
         robot = await lab.connected(lab.client_file("robot1", ROBOT, relay={"udp": False}))
         assert not [record for record in caplog.records if "again" in record.getMessage()]
-        assert relay.server is not None
-        relay.server.cut_client("robot1")
+        assert relay.transports.server is not None
+        relay.transports.server.cut_client("robot1")
         await until(lambda: any("the link is there again, after " in message for message in caplog.messages))
         await until(lambda: any("robot1 connected again, after " in message for message in caplog.messages))
         lines = {record.getMessage().partition(", after")[0]: record.levelname for record in caplog.records}
@@ -133,10 +133,10 @@ async def test_an_outage_that_began_with_silence_is_counted_from_there(
     async with Lab(tmp_path, "robot1") as lab:
         relay = await lab.relay()
         robot = await lab.connected(lab.client_file("robot1", ROBOT, relay={"udp": False}))
-        assert relay.server is not None
+        assert relay.transports.server is not None
         monkeypatch.setattr(robot.news, "look", lambda: None)  # would find that the relay answers, until it is cut off
         robot.news.outages.look("relay", lost=True, gone="silent", back="back", now=clock.now() - 100.0)
-        relay.server.cut_client("robot1")
+        relay.transports.server.cut_client("robot1")
         said = f"{lab.endpoint}: the link is there again, after "
         await until(lambda: any(message.startswith(said) for message in caplog.messages))
         (text,) = [message for message in caplog.messages if message.startswith(said)]
@@ -175,8 +175,8 @@ async def test_a_session_that_outlives_its_connection_says_that_there_is_another
         relay = await lab.relay()
         robot = await lab.connected(lab.client_file("robot1", ROBOT))
         await until(lambda: robot.core.link.lane.id == LANE_UDP, "data goes over UDP")
-        assert relay.server is not None
-        assert relay.server.connections.cut_user("robot1") >= 1
+        assert relay.transports.server is not None
+        assert relay.transports.server.connections.cut_user("robot1") >= 1
         await until(lambda: any("the connection is there again, after " in message for message in caplog.messages))
         assert not any("the link is there again" in message for message in caplog.messages)  # it was never gone
         assert robot.news.said == set()

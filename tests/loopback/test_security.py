@@ -23,7 +23,8 @@ import sern_relay.admission
 from sern_client.daemon import ClientDaemon
 from sern_core.vocabulary.types import ClientName, TopicName
 from sern_core.wire import framing
-from sern_relay.daemon import REFUSAL_CODES, RelayDaemon
+from sern_relay.daemon import RelayDaemon
+from sern_relay.hub_news import REFUSAL_CODES
 from sern_relay.relay_metrics import refused_connections
 from sern_relay.server import MAX_PORTS
 from sern_runtime.config.keys import (
@@ -63,7 +64,8 @@ class Bystanders:
         await until(lambda: self.arrived > count + 50, "the stream goes on")
 
     async def refused(self, reason: str) -> None:
-        await until(lambda: dict(refused_connections(self.relay.server))[reason,] > 0, f"the relay counts {reason}")
+        transports = self.relay.transports
+        await until(lambda: dict(refused_connections(transports.server))[reason,] > 0, f"the relay counts {reason}")
 
 
 @asynccontextmanager
@@ -145,7 +147,7 @@ async def test_a_name_that_is_not_the_keys_is_refused_to_the_client(
 
 async def test_a_claimed_routing_id_is_never_heard(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     async with bystanders(tmp_path, caplog) as world:
-        server = world.relay.server
+        server = world.relay.transports.server
         assert server is not None
         [victim] = [each.routing_id for each, _served in server.clients.sessions() if each.client == "robot1"]
         keys = load_secret(world.lab.directory / "robot2.key")
@@ -160,7 +162,7 @@ async def test_a_claimed_routing_id_is_never_heard(tmp_path: Path, caplog: pytes
 
 async def test_nobody_joins_the_session_of_another(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     async with bystanders(tmp_path, caplog) as world:
-        server = world.relay.server
+        server = world.relay.transports.server
         assert server is not None
         said = world.robot.core.link.handshake.join(0.0)  # as if it had been overheard
         assert said is not None
@@ -179,7 +181,7 @@ async def test_nobody_joins_the_session_of_another(tmp_path: Path, caplog: pytes
 
 async def test_one_client_has_a_few_connections(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     async with bystanders(tmp_path, caplog) as world, AsyncExitStack() as stack:
-        server = world.relay.server
+        server = world.relay.transports.server
         assert server is not None
         keys = load_secret(world.lab.directory / "robot2.key")
         stray = framing.encode_header(framing.Kind.DATA, 1, 1, 0)
@@ -203,7 +205,7 @@ async def test_connections_for_class_control_count_over_all_sessions(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with bystanders(tmp_path, caplog) as world, AsyncExitStack() as stack:
-        server = world.relay.server
+        server = world.relay.transports.server
         assert server is not None
         keys = load_secret(world.lab.directory / "robot2.key")
         lane = await stack.enter_async_context(Stranger(world.lab, keys))
@@ -233,7 +235,7 @@ async def test_a_client_is_given_a_lane_now_and_then(tmp_path: Path, monkeypatch
     async with Lab(tmp_path, *CLIENTS) as lab:
         relay = await lab.relay()
         robot = await lab.connected(lab.client_file("robot1", DEAD_ENDS))
-        lanes = relay.lanes
+        lanes = relay.transports.lanes
         assert lanes is not None
         name = ClientName("robot1")
         await until(lambda: name in lanes._lanes and name not in lanes._resting, "it has a lane, and has rested")
@@ -263,7 +265,7 @@ async def test_a_bad_frame_of_a_known_client_ends_its_connection_only(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, kind: str
 ) -> None:
     async with bystanders(tmp_path, caplog) as world:
-        server = world.relay.server
+        server = world.relay.transports.server
         assert server is not None
         async with Stranger(world.lab, load_secret(world.lab.directory / "robot2.key")) as stranger:
             for datagram in BAD[kind]():
@@ -301,7 +303,7 @@ async def test_access_rules_hold_and_name_what_they_refuse(tmp_path: Path, caplo
         await until(lambda: robot.bridge.outbound.refusals == 1)
         await until(lambda: sum(c.delivered for c in site.core.received.topics.values()) == 20)
         assert "the relay refuses /robot1/secret (forbidden): robot1 may not publish /robot1/secret" in caplog.text
-        assert {code: count for code, count in relay.refusals.items() if count} == {"forbidden": 1}
+        assert {code: count for code, count in relay.news.refusals.items() if count} == {"forbidden": 1}
         await lab.end(robot)
         summary = json.loads((tmp_path / "robot1.summary.json").read_text())["topics"]
         assert summary["/robot1/secret"]["delivered"] == 0
@@ -337,7 +339,7 @@ async def test_a_revoked_key_is_cut_off_both_ways_and_comes_back_when_allowed(
 ) -> None:
     async with bystanders(tmp_path, caplog) as world:
         lab, relay = world.lab, world.relay
-        assert relay.server is not None and relay.zap is not None
+        assert relay.transports.server is not None and relay.zap is not None
         bag = write_bag(tmp_path / "other.bag", {"/count": 500})
         loop: dict[str, Any] = {"rate": 1, "loop": True}
         config = lab.player_file("robot2", bag, play=loop, subscribe=["/robot1/.*"])
@@ -353,7 +355,7 @@ async def test_a_revoked_key_is_cut_off_both_ways_and_comes_back_when_allowed(
         key = lab.clients_dir / "robot2.pub"
         away = key.rename(tmp_path / "robot2.pub")
         relay.reload()
-        assert [each for each, _served in relay.server.clients.sessions() if each.client == "robot2"] == []
+        assert [each for each, _served in relay.transports.server.clients.sessions() if each.client == "robot2"] == []
         before = heard[topic].delivered
         await until(lambda: "refused our key" in second.news.reason)
         refused = relay.zap.counters.unknown_key
@@ -399,20 +401,20 @@ async def test_a_silent_connection_does_not_outlive_its_key(
         keys = (PublicKey(old.public_key, None, end_s), PublicKey(new.public_key))
         write_public(lab.clients_dir / "robot2.pub", PublicKeys(old.name, keys), replace=True)
         relay = await lab.relay()
-        assert relay.server is not None
+        assert relay.transports.server is not None
         async with Stranger(lab, old) as silent, Stranger(lab, old) as loud:
             await loud.send(hello("robot2"))
             await until(lambda: loud.received, "it has a session")
             await until(lambda: zmq.Event.HANDSHAKE_SUCCEEDED in silent.events, "admitted by its key, that holds")
-            relay._end_lapsed()
+            relay.enforcement.end_lapsed()
             assert zmq.Event.DISCONNECTED not in (*silent.events, *loud.events)
             wall = SimpleNamespace(time=lambda: end_s + 1.0, time_ns=time.time_ns)
             monkeypatch.setattr(sern_relay.admission, "time", wall)
-            table = relay.server.connections._connections
+            table = relay.transports.server.connections._connections
             assert len(table) == 2 and not any(connection.ended for connection in table.values())
-            relay._end_lapsed()
+            relay.enforcement.end_lapsed()
             assert all(connection.ended for connection in table.values())
-            assert list(relay.server.clients.sessions()) == []
+            assert list(relay.transports.server.clients.sessions()) == []
             await loud.cut()
             await silent.cut()
             monkeypatch.undo()
@@ -465,7 +467,7 @@ def test_every_refusal_of_the_core_has_a_counter() -> None:
 
 async def test_half_open_connections_are_bounded(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     async with bystanders(tmp_path, caplog) as world:
-        server = world.relay.server
+        server = world.relay.transports.server
         assert server is not None
         connections = [socketlib.create_connection((HOST, world.lab.port)) for _ in range(100)]
         try:

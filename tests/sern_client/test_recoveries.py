@@ -412,10 +412,10 @@ async def _relay(scene: Scene) -> Any:
 async def client_at_the_relay(scene: Scene) -> None:
     now = scene.clock()
     async with _relay(scene) as daemon:
-        daemon.client_up(ClientName("robot1"), resumed=False)
-        daemon.client_down(ClientName("robot1"), "connection lost")
+        daemon.news.client_up(ClientName("robot1"), resumed=False)
+        daemon.news.client_down(ClientName("robot1"), "connection lost")
         now.go_on()
-        daemon.client_up(ClientName("robot1"), resumed=True)
+        daemon.news.client_up(ClientName("robot1"), resumed=True)
 
 
 async def reload_of_the_relay(scene: Scene) -> None:

@@ -93,7 +93,7 @@ async def test_a_relay_that_never_started_drains_and_stops(tmp_path: Path) -> No
 async def test_a_part_that_cannot_end_keeps_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     daemon = made(tmp_path)
     await daemon.start()
-    server, lanes, zap = daemon.server, daemon.lanes, daemon.zap
+    server, lanes, zap = daemon.transports.server, daemon.transports.lanes, daemon.zap
     assert server is not None and lanes is not None and zap is not None
     said: list[str] = []
     ends = {"lanes": lanes.close, "server": server.close, "zap": zap.close}
@@ -127,7 +127,7 @@ async def test_refusals_are_counted_by_known_codes_and_metrics_read_them(tmp_pat
     registry = CollectorRegistry()
     register_relay(Metrics(registry), daemon)
     for code in ("forbidden", "forbidden", "made_up"):
-        daemon.refused(ClientName("robot1"), code, "no")
+        daemon.news.refused(ClientName("robot1"), code, "no")
     daemon.reloads.failures = 1
     text = generate_latest(registry).decode()
     for line in (

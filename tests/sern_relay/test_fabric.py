@@ -35,8 +35,8 @@ def relay(folder: Path, name: str, port: int, fabric_port: int) -> RelayDaemon:
 
 
 def fabric_of(daemon: RelayDaemon) -> RelayFabric:
-    assert daemon.fabric is not None
-    return daemon.fabric
+    assert daemon.transports.fabric is not None
+    return daemon.transports.fabric
 
 
 async def test_two_relays_see_each_other(tmp_path: Path) -> None:
