@@ -1,6 +1,7 @@
 """What goes into the next datagram of a lane: watermarks, control messages, and fragments of one class. Pure."""
 
 from collections.abc import Callable
+from enum import IntEnum
 from typing import Final
 
 from sern_core.link.background import Background
@@ -24,6 +25,14 @@ RIDE_BYTES: Final = 256
 """Most bytes of a control message that travel with each datagram of class 0. Where class 0 alone keeps the window shut,
 what would open a better lane, or another stream, must come through all the same."""
 MAX_WATERMARKS: Final = 64
+
+
+class Waiting(IntEnum):
+    """What waits for window and pacer of a lane, the most urgent of it."""
+
+    NOTHING = 0
+    BACKGROUND = 1
+    LIVE = 2
 
 
 class Composer:
@@ -142,14 +151,16 @@ class Composer:
             lane.priority = served
         return window_open
 
-    def waits(self, lane: Lane, now: float) -> bool:
-        """Whether something would leave if window and pacer let it. What the background holds back by itself does not:
-        the link was not full then. Unless a queue stays: then it is, and slower than it was."""
+    def waits(self, lane: Lane, now: float) -> Waiting:
+        """What would leave if window and pacer let it. What the background holds back by itself does not: the link was
+        not full then. Unless a queue stays: then it is, and slower than it was."""
         chosen = self._sender.scheduler.pick(now=now, window_open=True)
         if chosen is None or self._control.waits:
-            return self._control.waits
-        in_background = self._sender.channels[chosen].spec.background
-        return not in_background or lane.estimator.queues or self.background.room(lane, now)
+            return Waiting.LIVE if self._control.waits else Waiting.NOTHING
+        if not self._sender.channels[chosen].spec.background:
+            return Waiting.LIVE
+        full = lane.estimator.queues or self.background.room(lane, now)
+        return Waiting.BACKGROUND if full else Waiting.NOTHING
 
     def pick(self, now: float, *, window_open: bool) -> int | None:
         """The channel that the lane with the data would serve next; class control goes over the priority lane, if there

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from sern_core.link.answers import Answers
-from sern_core.link.composer import Composer
+from sern_core.link.composer import Composer, Waiting
 from sern_core.link.control_stream import CONTROL_CHANNEL_ID, ControlStream
 from sern_core.link.datagram import Datagram, SentData, SentWatermark
 from sern_core.link.end import End
@@ -124,14 +124,17 @@ class DataPlane:
         estimator = lane.estimator
         inflight_bytes = nbytes + (flight.inflight_bytes if lane.beside is None else lane.under_way_bytes)
         # What could be picked if window and pacer let it is held back by them; ordering `paper` holds back by itself.
-        waits = (lane is lanes.lane or lane is lanes.priority_lane) and self._composer.waits(lane, now)
+        carries = lane is lanes.lane or lane is lanes.priority_lane
+        waiting = self._composer.waits(lane, now) if carries else Waiting.NOTHING
+        waits = waiting is not Waiting.NOTHING
         path = lane.path
         app_limited = not waits and not path.held and inflight_bytes < estimator.window_bytes
         path.held = False
         flight.sent(now=now, nbytes=nbytes, items=draft.items, app_limited=app_limited, priority=lane.priority)
         estimator.on_sent(now=now, nbytes=nbytes, inflight_bytes=inflight_bytes)
         pacer = lane.pacer
-        paced = waits and inflight_bytes < estimator.window_bytes
+        # The background waits for room on the path, too, and makes good nothing.
+        paced = waiting is Waiting.LIVE and inflight_bytes < estimator.window_bytes
         pacer.sent(now=now, nbytes=nbytes, pacing_bps=estimator.pacing_bps, waits=paced)
         if lane is lanes.lane and (rate_bps := estimator.rate_bps) is not None:
             full_s = 8 * (lane.fragment_bytes + OVERHEAD_BYTES) / rate_bps

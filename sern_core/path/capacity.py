@@ -132,12 +132,12 @@ class CapacityEstimator(ABC):
 class Pacer:
     """Spreads what the window allows over time. Class 0 does not wait for it, but counts."""
 
-    __slots__ = ("_bps", "_late_s", "_next_s", "due_s")
+    __slots__ = ("_bps", "_next_s", "_waits", "due_s")
 
     def __init__(self) -> None:
         self._bps = 0.0  # the pace of the latest datagram
         self._next_s = 0.0
-        self._late_s = PACING_BURST_S  # what is not used until then may be made good
+        self._waits = False  # something waited for the pacer alone since the latest datagram
         self.due_s = 0.0
         """When the next datagram may leave. May be put off: what is not used then is made good like a late timer."""
 
@@ -150,8 +150,11 @@ class Pacer:
         `PACING_DEBT_S` at most. Without that bound a moment of a very low pace would hold them back for as long as
         class control had exceeded it."""
         if pacing_bps is not None:
-            earliest_s = now - self._late_s
-            self._late_s = PACING_LATE_S if waits else PACING_BURST_S
+            unused_s = PACING_BURST_S
+            if self._waits and now > self.due_s + unused_s:
+                unused_s = min(now - self.due_s, PACING_LATE_S)
+            self._waits = waits
+            earliest_s = now - unused_s
             own_s = 8 * nbytes / pacing_bps
             begin_s = self._next_s if self._next_s > earliest_s else earliest_s
             self.due_s = self._next_s = max(begin_s, min(begin_s + own_s, now + max(own_s, PACING_DEBT_S)))

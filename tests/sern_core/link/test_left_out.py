@@ -20,7 +20,7 @@ def test_a_stream_that_nobody_wants_is_not_told_of_again_as_left_out(monkeypatch
     def on_skipped(_link: Link, _stream: InStream, count: int, *, now: float) -> None:
         told.append(count)
 
-    monkeypatch.setattr(peer.hub, "on_skipped", on_skipped)
+    monkeypatch.setattr(peer.hub.link_handler, "on_skipped", on_skipped)
 
     def read_on() -> None:
         while (due_s := end.reading.due_s) is not None:

@@ -27,7 +27,7 @@ CORE = [
         "site/client.py", "site/subscription.py", "site/object_mirror.py",
         "link/streams_in.py",
         "link/streams_out.py",
-        "relay/hub.py", "relay/moves.py", "relay/peers.py",
+        "relay/hub.py", "relay/hub_link_handler.py", "relay/moves.py", "relay/peers.py",
         "relay/hub_port.py", "relay/hub_subscriptions.py",
         "relay/claims.py", "relay/peer_control.py", "relay/peer_rules.py", "relay/revocations.py",
         "relay/object_exchange.py", "relay/peer_objects.py", "relay/feed_owners.py",
