@@ -33,7 +33,7 @@ class Stream:
     taker: str
     reliable: bool = False
     lifespan_s: float | None = None
-    """Of a command."""
+    """How long a command counts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,7 @@ class Row:
     gap_s: float
     """From the kill to the arrival of the first message that was sent after it; `NEVER` where none came."""
     after_s: float
-    """Of what was sent after that one arrived."""
+    """The latency of what was sent after that one had arrived."""
     lost: int
     doubled: int
     out_of_order: int

@@ -74,9 +74,7 @@ class Composer:
         control_only = lane is self._lanes.priority_lane
         window_open = lane.open_at(now)
         pends = scheduler.pends
-        if not pends:
-            self._outlook.nothing_waits()
-        elif not window_open:
+        if not window_open and pends:
             self._outlook.waits(now)
             if scheduler.pending(PriorityClass.STATE) or scheduler.pending(PriorityClass.BULK):
                 self.background.live_waits(now)
@@ -155,6 +153,8 @@ class Composer:
         """What would leave if window and pacer let it. What the background holds back by itself does not: the link was
         not full then. Unless a queue stays: then it is, and slower than it was."""
         chosen = self._sender.scheduler.pick(now=now, window_open=True)
+        if chosen is None:
+            self._outlook.nothing_waits()
         if chosen is None or self._control.waits:
             return Waiting.LIVE if self._control.waits else Waiting.NOTHING
         if not self._sender.channels[chosen].spec.background:

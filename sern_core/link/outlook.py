@@ -92,7 +92,8 @@ class Outlook:
         if channel.reliable or lifespan_s is None or out.size <= LARGE_FRAGMENTS * lane.fragment_bytes:
             return True
         tried = self._tried == (channel.channel_id, out.seq)
-        if out.started and (not tried or now < self._judged_s):
+        # One that is tried may have to wait for the next datagram: what was before it in this one is of another class.
+        if now < self._judged_s if tried else out.started:
             return True
         rate_bps = lane.estimator.rate_bps
         if rate_bps is None or out.message.drop_marker:

@@ -139,7 +139,7 @@ class Pacer:
         self._next_s = 0.0
         self._waits = False  # something waited for the pacer alone since the latest datagram
         self.due_s = 0.0
-        """When the next datagram may leave. May be put off: what is not used then is made good like a late timer."""
+        """When the next datagram may leave. May be put off: of what is not used then `PACING_BURST_S` is made good."""
 
     def ready(self, now: float) -> bool:
         return now >= self.due_s

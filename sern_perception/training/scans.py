@@ -177,7 +177,7 @@ def _intensity(
 
 
 def make(seed: int, count: int, sensor: Sensor, *, each_world: int = 8) -> Scans:
-    """So many scans, `each_world` of them in one world; the same seed gives the same."""
+    """Makes `count` scans, `each_world` of them in one world; the same seed gives the same."""
     random = Random(seed)
     noise = np.random.default_rng(seed)
     shape = (sensor.rows, sensor.columns)

@@ -34,7 +34,7 @@ from sern_runtime.whole_file import write_whole
 PUBLIC_SUFFIX: Final = ".pub"
 SECRET_SUFFIX: Final = ".key"
 NEXT_SUFFIX: Final = ".next.key"
-"""Of the pair that is to take the place of NAME.key, beside it."""
+"""The end of the name of the pair that is to take the place of NAME.key, beside it."""
 REVOKED_DIR: Final = "revoked"
 SECRET_MODE: Final = 0o600
 PUBLIC_MODE: Final = 0o644

@@ -72,7 +72,7 @@ class SealedPort:
         self._wall_s = wall_s
         self._met: dict[ClientName, list[_Met]] = {}
         self._up: dict[ClientName, _Met] = {}
-        """Of the processes of a name that are there the one that came last."""
+        """The process that came last, of those of a name that are there."""
         self._carrier = ZenohPort(options, self, most_bytes=MAX_DATAGRAM_BYTES + SEALING_BYTES)
 
     @property

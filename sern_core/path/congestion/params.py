@@ -76,7 +76,7 @@ class HybridParams:
     startup_far: float = 2.0
     """... and far more than full if they took so many times as long."""
     startup_rounds: int = 2
-    """So many rounds in a row show that it is full, where packets come unevenly."""
+    """Rounds in a row that show that it is full, where packets come unevenly."""
 
     # Pacing
     pacing_gain: float = 1.03

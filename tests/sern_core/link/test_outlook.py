@@ -32,9 +32,9 @@ class Robot:
             8 * 10_000 / rate_bps, self.robot.publish(CAMERA, spec(priority, lifespan_s=1.0)), bytes(10_000)
         )
 
-    def scans(self) -> None:
-        """Scans of two fragments, ten a second."""
-        self.robot.every(0.1, self.robot.publish(SCAN, spec(PriorityClass.STATE)), bytes(2_000))
+    def scans(self, every_s: float) -> None:
+        """Scans of two fragments."""
+        self.robot.every(every_s, self.robot.publish(SCAN, spec(PriorityClass.STATE)), bytes(2_000))
 
     def carried_bps(self, seconds: float) -> float:
         """What goes over the link in the next seconds."""
@@ -132,11 +132,12 @@ def test_a_link_that_got_faster_is_found_out() -> None:
     assert robot.arrived(CLOUD, 4.0) >= 6
 
 
+@pytest.mark.parametrize("every_s", [0.1, 0.3])
 @pytest.mark.parametrize("lossless", [False, True])
-def test_a_faster_link_is_found_beside_messages_of_a_few_fragments(*, lossless: bool) -> None:
+def test_a_faster_link_is_found_beside_messages_of_a_few_fragments(every_s: float, *, lossless: bool) -> None:
     """They wait for the pacer for a moment, and so does what comes behind them: that is no full link."""
     robot = Robot(0.3e6, 100_000, RateStep(20.0, 40e6), lossless=lossless)
-    robot.scans()
+    robot.scans(every_s)
     robot.world.run(20.0)
     before = len(robot.site.on(CLOUD))
     robot.world.run(6.0)
