@@ -93,7 +93,8 @@ class Outlook:
             return True
         tried = self._tried == (channel.channel_id, out.seq)
         # One that is tried may have to wait for the next datagram: what was before it in this one is of another class.
-        if now < self._judged_s if tried else out.started:
+        # And one that was begun to be encoded is not under way yet.
+        if now < self._judged_s if tried else out.ranges is not None:
             return True
         rate_bps = lane.estimator.rate_bps
         if rate_bps is None or out.message.drop_marker:

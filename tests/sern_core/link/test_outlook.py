@@ -1,7 +1,10 @@
 """Large messages that the link cannot carry within their lifespan: not begun, and begun again once it can."""
 
+from random import Random
+
 import pytest
 
+from sern_core.vocabulary.codec_names import Compression
 from sern_core.vocabulary.types import DropReason, PriorityClass
 from sern_sim.models import LinkModel, RateStep
 from tests.world import World, spec
@@ -15,16 +18,29 @@ class Robot:
     """A robot with 12.5 poses a second, and large clouds of a second's lifespan, on a link of 25 ms each way."""
 
     def __init__(
-        self, rate_bps: float, cloud_bytes: int, *steps: RateStep, reliable: bool = False, lossless: bool = False
+        self,
+        rate_bps: float,
+        cloud_bytes: int,
+        *steps: RateStep,
+        reliable: bool = False,
+        lossless: bool = False,
+        encode_bytes_per_s: float | None = None,
     ) -> None:
-        self.world = World(lossless=lossless)
+        encoded = encode_bytes_per_s is not None
+        self.world = World(lossless=lossless, compress=encoded, encode_bytes_per_s=encode_bytes_per_s)
         link = LinkModel(rate_bps=rate_bps, delay_s=0.025, rate_steps=steps)
         self.robot = self.world.client("robot", link, LinkModel(delay_s=0.025))
         self.site = self.world.client("site", patterns=["/robot/.*"])
         self.robot.every(0.08, self.robot.publish(POSE, spec(PriorityClass.CONTROL)), bytes(100))
-        cloud = spec(PriorityClass.BULK, lifespan_s=None if reliable else 1.0, reliable=reliable)
+        cloud = spec(
+            PriorityClass.BULK,
+            lifespan_s=None if reliable else 1.0,
+            reliable=reliable,
+            compression=Compression.LZ4 if encoded else Compression.NONE,
+        )
         self.cloud = self.robot.publish(CLOUD, cloud)
-        self.robot.every(0.1, self.cloud, bytes(cloud_bytes))
+        body = Random(1).randbytes(cloud_bytes) + bytes(cloud_bytes) if encoded else bytes(cloud_bytes)
+        self.robot.every(0.1, self.cloud, body)
 
     def camera(self, priority: PriorityClass, rate_bps: float) -> None:
         """Images of 10 kB, offered at that rate, beside the clouds."""
@@ -69,6 +85,15 @@ def test_what_cannot_arrive_is_hardly_ever_begun() -> None:
     assert robot.carried_bps(20.0) < POSES_BPS + 0.15 * 1e6
     assert robot.arrived(CLOUD, 1.0) == 0
     assert robot.cloud.counters.by_reason[DropReason.TOO_SLOW] > 200
+
+
+def test_what_cannot_arrive_once_it_is_encoded_is_hardly_ever_begun() -> None:
+    """Half of it is zeros. The codec takes it to its thread before anything of it leaves."""
+    robot = Robot(1e6, 300_000, encode_bytes_per_s=60e6)
+    robot.world.run(10.0)
+    assert robot.carried_bps(20.0) < POSES_BPS + 0.15 * 1e6
+    assert robot.too_slow > 200
+    assert robot.cloud.codec is not None and robot.cloud.codec.ratio < 0.6
 
 
 def test_what_can_arrive_has_the_link_instead() -> None:
