@@ -202,7 +202,9 @@ class HybridWindow(CapacityEstimator):
                 self._cut_at_once(now, queue_s)
         else:
             self._backoff.far_since_s = None
-        if mode is not STEADY:
+        if mode.draining and not mode.competing:
+            self._sooner.makes_way(now, path.rtt_s or 0.0)
+        elif mode is not STEADY:
             self._sooner.hold(now, path.rtt_s or 0.0)
         elif 2 * sample.packet_bytes >= path.fragment:
             self._look_for_faster_link(now, queue_s)
@@ -304,7 +306,7 @@ class HybridWindow(CapacityEstimator):
         if times > 1.0:
             self._growth.got_quicker(now)
             self._window *= times
-            self._start_again(now)
+            self._start_again(now, quicker=True)
 
     def _look_for_slower_link(self, sample: AckSample) -> None:
         rate = self._backoff.look_for_slower_link(sample)
@@ -320,11 +322,12 @@ class HybridWindow(CapacityEstimator):
 
     # --- start-up -------------------------------------------------------------------------------------------------
 
-    def _start_again(self, now: float) -> None:
+    def _start_again(self, now: float, *, quicker: bool = False) -> None:
         self._happens(Event.RESTART)
         self._rival.cubic = None
         self._pace.set(self._mode, self._window)
-        self._start.begin(now, self._window, self._pace.value, may_jitter=self._view.may_jitter)
+        may_jitter = self._view.may_jitter
+        self._start.begin(now, self._window, self._pace.value, quicker=quicker, may_jitter=may_jitter)
 
     def _ramp(self, sample: AckSample) -> None:
         """One acknowledgement of start-up."""

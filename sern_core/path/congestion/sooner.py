@@ -14,6 +14,8 @@ SOONER_SUM: Final = 1.8
 least delay that is gone by."""
 SOONER_TIMES: Final = 2.0
 """The window grows by no more at once: the least delay may have been that of a short queue."""
+CLEAR_SHARE: Final = 0.5
+"""After the queue has made way by so much: the least delay may have been that of half a packet."""
 HOLD_S: Final = 1.0
 HOLD_RTTS: Final = 4
 """After anything else than steering a queue may have gone, which the least delay is not free of at once."""
@@ -23,11 +25,11 @@ class Sooner:
     """A packet of L bytes takes L/C on a link of rate C, so one that comes by x sooner than over the empty path shows a
     link of at least L/(L/C − x). Only where a packet takes long can that be told from noise."""
 
-    __slots__ = ("_least_s", "_params", "_sum", "_until_s")
+    __slots__ = ("_clear_until_s", "_least_s", "_params", "_sum", "_until_s")
 
     def __init__(self, params: HybridParams) -> None:
         self._params = params
-        self._until_s = 0.0
+        self._until_s = self._clear_until_s = 0.0
         self.restart()
 
     def restart(self) -> None:
@@ -40,12 +42,18 @@ class Sooner:
         self._until_s = now + HOLD_S + HOLD_RTTS * rtt_s
         self.restart()
 
+    def makes_way(self, now: float, rtt_s: float) -> None:
+        """The queue does, so packets show the least delay: for a while believe only what is more than a queue."""
+        self._clear_until_s = now + HOLD_S + HOLD_RTTS * rtt_s
+        self.restart()
+
     def times(self, now: float, early_s: float, view: QueueView) -> float:
         """A large packet came `early_s` sooner than over the empty path: how many times as fast the link is at least;
         1.0: nothing tells that it is."""
         took_s = view.serialise_s
         noise_s = max(0.0, view.jitter_s - took_s)
-        if took_s < self._params.gentle_packet_s or early_s < SOONER_SHARE * took_s + noise_s:
+        share = CLEAR_SHARE if now < self._clear_until_s else SOONER_SHARE
+        if took_s < self._params.gentle_packet_s or early_s < share * took_s + noise_s:
             self.restart()
             return 1.0
         self._least_s = min(self._least_s, early_s)
