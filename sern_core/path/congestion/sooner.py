@@ -52,8 +52,10 @@ class Sooner:
         1.0: nothing tells that it is."""
         took_s = view.serialise_s
         noise_s = max(0.0, view.jitter_s - took_s)
-        share = CLEAR_SHARE if now < self._clear_until_s else SOONER_SHARE
-        if took_s < self._params.gentle_packet_s or early_s < share * took_s + noise_s:
+        clear = now < self._clear_until_s
+        least_s = (CLEAR_SHARE if clear else SOONER_SHARE) * took_s + noise_s
+        # No link saves more than the packet took: then it was a queue that is gone.
+        if took_s < self._params.gentle_packet_s or early_s < least_s or (clear and early_s > took_s):
             self.restart()
             return 1.0
         self._least_s = min(self._least_s, early_s)
