@@ -306,7 +306,7 @@ class HybridWindow(CapacityEstimator):
         if times > 1.0:
             self._growth.got_quicker(now)
             self._window *= times
-            self._start_again(now, quicker=True)
+            self._start_again(now)
 
     def _look_for_slower_link(self, sample: AckSample) -> None:
         rate = self._backoff.look_for_slower_link(sample)
@@ -322,12 +322,11 @@ class HybridWindow(CapacityEstimator):
 
     # --- start-up -------------------------------------------------------------------------------------------------
 
-    def _start_again(self, now: float, *, quicker: bool = False) -> None:
+    def _start_again(self, now: float) -> None:
         self._happens(Event.RESTART)
         self._rival.cubic = None
         self._pace.set(self._mode, self._window)
-        may_jitter = self._view.may_jitter
-        self._start.begin(now, self._window, self._pace.value, quicker=quicker, may_jitter=may_jitter)
+        self._start.begin(now, self._window, self._pace.value, may_jitter=self._view.may_jitter)
 
     def _ramp(self, sample: AckSample) -> None:
         """One acknowledgement of start-up."""

@@ -36,7 +36,6 @@ class StartUp:
         "_pace",
         "_packets",
         "_params",
-        "_quicker",
         "_resumed",
         "_rtt_s",
         "_shown",
@@ -53,18 +52,10 @@ class StartUp:
         self.begin(-inf, 0.0, None)
 
     def begin(
-        self,
-        now: float,
-        window: float,
-        pace: float | None,
-        *,
-        resumed: bool = False,
-        quicker: bool = False,
-        may_jitter: bool = True,
+        self, now: float, window: float, pace: float | None, *, resumed: bool = False, may_jitter: bool = True
     ) -> None:
         """The first round. `resumed`: after a silence, of what we have left to send and not of a full window.
-        `quicker`: of a window that was full and is larger now, so that most of it leaves as acknowledgements let it
-        go. `may_jitter`: the path is not known to be without jitter."""
+        `may_jitter`: the path is not known to be without jitter."""
         self.jittery = False
         """Whether packets that left one after the other have come unevenly: jitter did that."""
         self._may_jitter = may_jitter
@@ -76,7 +67,7 @@ class StartUp:
         """How many are over."""
         self._least_rtt_s = inf  # the least mean of a round: with hardly a queue of ours
         self.begin_round(now, window, pace)
-        self._resumed, self._quicker = resumed, quicker
+        self._resumed = resumed
 
     def begin_round(self, now: float, window: float, pace: float | None) -> None:
         """The next one."""
@@ -85,7 +76,7 @@ class StartUp:
             self._shown = max(self._shown, self._train.whole_rate)
         self._before = self.rate
         self.rounds += 1
-        self._resumed = self._quicker = False
+        self._resumed = False
         self.since_s = now
         self._window = window
         self._pace = pace
@@ -130,14 +121,14 @@ class StartUp:
             return self._jittery_ramp(window, fragment)
         # By chance a few of many packets that jitter spreads come evenly: no link is slower than all of a round.
         rate = max(train.even_rate, train.whole_rate, self._shown) if self._may_jitter else train.rate
-        if not train.spread and (self._resumed or self._quicker):
+        if self._resumed and not train.spread:
             rate = inf  # as it had left: by our own sending
         seen, held = rate * rtt_s, self._held(rate)
         if held and window > seen + 2 * fragment:
             return Ramp(seen + fragment, filled=True, round_over=False)
         if train.nbytes < self._window / 4:
             return None
-        window = self._grown(window, seen, even=not self._quicker)
+        window = self._grown(window, seen, even=True)
         return Ramp(window, filled=held and window >= 0.85 * seen, round_over=True)
 
     def _jittery_ramp(self, window: float, fragment: float) -> Ramp | None:
