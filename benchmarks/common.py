@@ -15,6 +15,7 @@ import argparse
 import importlib
 import json
 import os
+import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
@@ -286,7 +287,10 @@ def main(
     description: str | None = None,
     arguments: Callable[[argparse.ArgumentParser], None] | None = None,
 ) -> int:
-    """Parse the arguments, run, print, write; the exit code. `arguments` may add options of the benchmark's own."""
+    """Parse the arguments, run, print, write; the exit code. `arguments` may add options of the benchmark's own.
+
+    Ctrl-C and SIGTERM end what was started with it: without that, processes would go on and take the CPU of whatever
+    is measured next."""
     parser = argparse.ArgumentParser(prog=f"python -m benchmarks.{benchmark}", description=description)
     parser.add_argument("--quick", action="store_true", help="fewer repetitions, for continuous integration")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures to FILE")
@@ -294,6 +298,7 @@ def main(
         arguments(parser)
     options = parser.parse_args()
     report = Report(benchmark)
+    handlers = {number: signal.signal(number, signal.default_int_handler) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         if options.json is not None:  # before the work, not after it
             options.json.parent.mkdir(parents=True, exist_ok=True)
@@ -304,4 +309,10 @@ def main(
     except (SernError, OSError, BrokenExecutor) as error:
         print(f"benchmarks.{benchmark}: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        print(f"benchmarks.{benchmark}: interrupted", file=sys.stderr)
+        return 130
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
     return 0

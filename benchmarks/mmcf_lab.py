@@ -10,7 +10,6 @@ beside the checkout their topics are made up (`benchmarks.recordings`), and a no
 import argparse
 import asyncio
 import json
-import signal
 import sys
 import tempfile
 import time
@@ -326,10 +325,5 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that everything is stopped then, too
     about = __doc__.splitlines()[0] if __doc__ else None
-    try:
-        sys.exit(main("mmcf_lab", measure, description=about, arguments=_arguments))
-    except KeyboardInterrupt:
-        print("benchmarks.mmcf_lab: interrupted", file=sys.stderr)
-        sys.exit(130)
+    sys.exit(main("mmcf_lab", measure, description=about, arguments=_arguments))

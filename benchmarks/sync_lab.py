@@ -10,7 +10,6 @@ at which the twin was asked for. Needs root.
 import argparse
 import asyncio
 import math
-import signal
 import sys
 import tempfile
 import time
@@ -167,9 +166,5 @@ def measure(options: argparse.Namespace, report: Report) -> None:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     about = __doc__.splitlines()[0] if __doc__ else None
-    try:
-        sys.exit(main("sync_lab", measure, description=about))
-    except KeyboardInterrupt:
-        sys.exit(130)
+    sys.exit(main("sync_lab", measure, description=about))

@@ -16,10 +16,9 @@ systems of the path: fabric (datagrams as large as 3 ms of the link, which may b
 
 import argparse
 import importlib.util
-import signal
 import sys
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Final
 
 from benchmarks.common import MissingError, Report, main, repetition_arguments, try_realtime
 from benchmarks.fabric import failover, loopback, path, relays, robots, twenty
@@ -57,10 +56,5 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--verbose", action="store_true", help="say what each run over the path saw")
 
 
-def _interrupted(*_: Any) -> None:
-    raise KeyboardInterrupt
-
-
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, _interrupted)  # so that the lab is removed then, too
     sys.exit(main("fabric", bench, description=__doc__, arguments=_arguments))

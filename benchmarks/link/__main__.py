@@ -10,7 +10,6 @@ seals and sends each datagram in the relay's place), whose latency and CPU the l
 """
 
 import argparse
-import signal
 import sys
 from pathlib import Path
 
@@ -26,18 +25,13 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main() -> int:
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that everything is stopped then, too
     complete = True
 
     def bench(options: argparse.Namespace, report: common.Report) -> None:
         nonlocal complete
         complete = bench_all(options, report, common.try_realtime())  # all that is started inherits the priority
 
-    try:
-        code = common.main("link", bench, description=__doc__, arguments=_arguments)
-    except KeyboardInterrupt:
-        print("benchmarks.link: interrupted", file=sys.stderr)
-        return 130
+    code = common.main("link", bench, description=__doc__, arguments=_arguments)
     return code if complete else 1
 
 

@@ -8,7 +8,6 @@ zenoh (as it comes), zenoh-tuned-bbr (priorities, express for the scan, two conn
 import argparse
 import asyncio
 import importlib.util
-import signal
 import sys
 import tempfile
 import time
@@ -139,12 +138,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main() -> int:
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that everything is stopped then, too
-    try:
-        return common.main("sensors", bench, description=__doc__, arguments=_arguments)
-    except KeyboardInterrupt:
-        print("benchmarks.sensors: interrupted", file=sys.stderr)
-        return 130
+    return common.main("sensors", bench, description=__doc__, arguments=_arguments)
 
 
 if __name__ == "__main__":

@@ -2,8 +2,12 @@
 
 import argparse
 import asyncio
+import multiprocessing
+import os
+import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from multiprocessing import Pipe, resource_tracker
 from multiprocessing.connection import Connection
@@ -24,8 +28,26 @@ def refuses() -> None:
     raise SernError("no such link")
 
 
+def goes_on() -> None:
+    threading.Event().wait()
+
+
 def answers(end: Connection, factor: int) -> None:
     end.send(factor * end.recv())
+
+
+def ended_by_a_signal(report_to: Connection, number: int) -> None:
+    """A benchmark whose worker goes on for ever; it gets the signal in the middle."""
+
+    def bench(_options: argparse.Namespace, _report: common.Report) -> None:
+        worker = Worker("the publisher", goes_on)
+        worker.start()
+        report_to.send(worker.pid)
+        os.kill(os.getpid(), number)
+        goes_on()
+
+    sys.argv = ["relay"]
+    sys.exit(common.main("relay", bench))
 
 
 @pytest.fixture
@@ -132,3 +154,19 @@ def test_a_worker_answers_and_one_that_ends_instead_is_an_error(monkeypatch: pyt
                 worker.ask(ours, 6)
         finally:
             worker.end(patient=True)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.usefixtures("spawning")
+def test_a_benchmark_that_is_ended_leaves_no_worker(number: int, capfd: pytest.CaptureFixture[str]) -> None:
+    ours, theirs = Pipe()
+    process = multiprocessing.get_context("spawn").Process(target=ended_by_a_signal, args=(theirs, number))
+    process.start()
+    theirs.close()
+    with ours:
+        pid = ours.recv()
+    process.join(DEADLINE_S)
+    assert process.exitcode == 130
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
+    assert capfd.readouterr().err == "benchmarks.relay: interrupted\n"
