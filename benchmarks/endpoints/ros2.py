@@ -139,10 +139,13 @@ async def _services(sink: End, calls: int) -> Figures:
     goals = await sink.do("give", count=calls // 4)
     for part in GOAL:
         found[f"goal_{part}_p50_ms"] = _median(goals[f"{part}_ms"])
+    found["goal_feedback_lost"] = goals["feedback_lost"]
     return found
 
 
 def _median(values: list[float]) -> float:
+    if not values:
+        raise SernError("of all that was asked nothing came back")
     return sorted(values)[len(values) // 2]
 
 
@@ -204,6 +207,6 @@ def bench(options: argparse.Namespace, report: common.Report) -> None:
         report.reach(f"ros2: {what}, times that of direct", found.times(CHAIN, DIRECT, metric), limit)
         beside_bare.append(f"{what} {found.times(CHAIN, BARE, metric):.2g}")
     report.note(f"ros2 sern-chain, times a bare bridge in rclpy: {', '.join(beside_bare)}")
-    for name in ("odom", "cloud", "talk"):
-        report.reach(f"ros2: {name} lost", ours[f"{name}_lost"], 0)
+    for name in ("odom", "cloud", "talk", "goal_feedback"):
+        report.reach(f"ros2: {name.replace('_', ' ')} lost", ours[f"{name}_lost"], 0)
     report.reach("ros2: messages doubled or echoed", ours["talk_doubled"], 0)
