@@ -1,5 +1,6 @@
 """`sern-client --config client.yaml`."""
 
+import gc
 import signal
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -37,6 +38,7 @@ def command(
 def main() -> None:
     # Until the event loop takes the signals over: Ctrl-C during the imports is an end, not a traceback.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    gc.disable()  # imports leave next to nothing to collect; `CollectorWatch.settle` has it go on
     typer.run(command)
 
 

@@ -1,9 +1,9 @@
 """Python's garbage collector, kept from holding up the event loop; and how long it does.
 
 A full pass looks at every object there is: 70 ms for what a daemon has imported and built when it has started, before
-any peer came. `settle` takes all that out of its sight. Passes are rarer from then on: the data path makes no cycles,
-so there is next to nothing to be found. They go on, as sessions and streams that end do leave some, and look at what
-has come since the start.
+any peer came. So the programs start without passes, and `settle` takes all that out of their sight. They are rare from
+then on: the data path makes no cycles, so there is next to nothing to be found. They go on, as sessions and streams
+that end do leave some, and look at what has come since the start.
 """
 
 import gc
@@ -47,6 +47,7 @@ class CollectorWatch:
         gc.collect()
         self._settling = False
         gc.freeze()
+        gc.enable()
 
     def close(self) -> None:
         """Idempotent."""

@@ -10,8 +10,6 @@ import logging
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Final
 
-from aiohttp import web
-from aiohttp.http_exceptions import HttpProcessingError
 from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import choose_encoder
 
@@ -21,6 +19,7 @@ from sern_runtime.http_connections import HttpConnections
 from sern_runtime.http_routes import HealthCheck, JsonParts, JsonQuery, JsonSource, UnknownError
 from sern_runtime.metrics import Metrics, exposition
 from sern_runtime.optional import OptionalParts
+from sern_runtime.web import HttpProcessingError, web
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 

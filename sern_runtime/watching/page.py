@@ -15,11 +15,10 @@ from collections.abc import Iterator
 from importlib.resources import files
 from typing import Final
 
-from aiohttp import web
-
 from sern_runtime.http import Handler, HttpServer
 from sern_runtime.metrics import Metrics
 from sern_runtime.watching.live import SLOW, FullError, Live
+from sern_runtime.web import web
 
 SLOW_S: Final = 15.0
 """A page that has taken nothing of what was sent to it for so long is cut."""

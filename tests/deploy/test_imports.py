@@ -1,5 +1,6 @@
 """A daemon imports what its file asks for: a robot's memory and its start are not spent on what is not used."""
 
+import os
 import subprocess
 import sys
 
@@ -35,3 +36,24 @@ def test_what_no_file_asked_for_is_not_imported(program: str) -> None:
 def test_the_guard_needs_neither_link_nor_adaptation() -> None:
     there = imported_by("sern_client.guard_process")
     assert not {"zmq", "sern_core.link.link", "sern_core.adaptation.policy", "prometheus_client"} & there
+
+
+@pytest.mark.parametrize("first", ["sern_runtime.http", "sern_runtime.watching.page"])
+def test_a_daemon_reads_no_certificates_for_a_client_that_it_does_not_use(first: str) -> None:
+    program = f"""
+import os, ssl
+made, contexts = ssl.create_default_context, []
+def make(*arguments, **settings):
+    contexts.append(made(*arguments, **settings))
+    return contexts[-1]
+ssl.create_default_context = make
+before = dict(os.environ)
+import {first}
+assert dict(os.environ) == before
+print(*(context.cert_store_stats()["x509"] for context in contexts))
+"""
+    for environment in ({}, {"SSL_CERT_FILE": "/nowhere"}):
+        ended = subprocess.run(
+            [sys.executable, "-c", program], capture_output=True, text=True, check=True, env=os.environ | environment
+        )
+        assert ended.stdout.split() == ["0"]

@@ -64,6 +64,7 @@ def test_what_is_there_stays_and_what_comes_is_collected(watch: CollectorWatch) 
     assert watch.passes == [0, 0, 0], "the pass at the start is counted"
     assert gc.get_threshold() == THRESHOLDS
     assert gc.get_freeze_count() > 10_000
+    assert gc.isenabled(), "a program starts without it"
     node = Node()
     node.other = node
     gone = weakref.ref(node)
