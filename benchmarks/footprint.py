@@ -4,7 +4,8 @@ The daemons are those of the installed programs, with the example files, keys an
 client after the other that connects to it. Ready is READY=1 of sd_notify(3), at which systemd goes on; the time counts
 from the start of the process. Memory is read some seconds later: `rss` is all that is resident, `own` what the end of
 the process would free (USS), `anonymous` what no file stands behind. The guard of a client's commands is a process of
-its own. A client of ROS 1 is measured without a master: its node waits for one.
+its own. A client of ROS 1 is measured without a master: its node waits for one. Beside them `libraries`: an
+interpreter that only imports what a relay needs of others' libraries, message definitions among them.
 """
 
 import argparse
@@ -15,6 +16,7 @@ import socket
 import statistics
 import sys
 import tempfile
+from asyncio.subprocess import PIPE
 from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -23,8 +25,9 @@ import psutil
 
 from benchmarks import common
 from benchmarks.child import environment
+from sern_core.vocabulary.errors import SernError
 from sern_runtime import clock
-from sern_tools.harness.processes import Child, Children, cpu_s, daemon, killed
+from sern_tools.harness.processes import Child, Children, cpu_s, daemon, killed, python
 from sern_tools.keygen import make_keys
 from sern_tools.ports import free_ports
 
@@ -46,6 +49,10 @@ CLIENTS: Final = {
     "robot with ROS 2, DDS": Client("jackal-jazzy.yaml", guarded=True, module="cyclonedds"),
 }
 GUARD: Final = "sern_client.guard_process"
+LIBRARIES: Final = (
+    "aiohttp.web", "cryptography", "msgpack", "numpy", "prometheus_client", "pydantic", "ruamel.yaml", "typer",
+    "uvloop", "zmq", "rosbags.typesys.stores.ros1_noetic", "rosbags.typesys.stores.ros2_jazzy",
+)  # fmt: skip
 READY_S: Final = 30.0
 READY_LIMIT_S: Final = 1.0
 
@@ -119,8 +126,23 @@ async def _start(children: Children, name: str, command: list[str]) -> tuple[Chi
         told.close()
 
 
+async def _libraries() -> Footprint:
+    """What the libraries take to be imported; memory as it is then."""
+    code = f"import sys, {', '.join(LIBRARIES)}; print(flush=True); sys.stdin.read()"
+    began_s = clock.now()
+    process = await asyncio.create_subprocess_exec(*python("-c", code), stdin=PIPE, stdout=PIPE)
+    try:
+        assert process.stdout is not None
+        if not await process.stdout.readline():
+            raise SernError("an interpreter cannot import the libraries")
+        return Footprint(clock.now() - began_s, cpu_s(process.pid), *_memory(psutil.Process(process.pid)))
+    finally:
+        process.kill()
+        await process.wait()
+
+
 async def _measure(settle_s: float) -> dict[str, Footprint]:
-    found: dict[str, Footprint] = {}
+    found = {"libraries": await _libraries()}
     with tempfile.TemporaryDirectory() as there:
         folder = Path(there)
         _prepare(folder)
@@ -164,8 +186,8 @@ def bench(options: argparse.Namespace, report: common.Report) -> None:
                 figures[metric] = statistics.median(values)
         for metric in ("rss", "own", "anonymous"):
             figures[f"{metric}_MB"] = statistics.median(getattr(each, f"{metric}_bytes") for each in taken) / 1e6
-        report.row(name, "sern", **figures)
-        if "ready_s" in figures:
+        report.row(name, "python" if name == "libraries" else "sern", **figures)
+        if "ready_s" in figures and name != "libraries":
             report.reach(f"{name}: ready after, s", figures["ready_s"], READY_LIMIT_S)
     report.note(f"example files, CURVE, loopback; medians of {rounds} rounds, memory {settle_s:g} s after the start")
 

@@ -34,7 +34,7 @@ OF_ROS = {f"robot with ROS {kind}{part}" for kind in KINDS for part in ("", ": g
             if importlib.util.find_spec("zenoh")
             else []
         ),
-        ("footprint", ["--seconds", "0.2"], {"relay", "simulated robot", "simulated site", *OF_ROS}),
+        ("footprint", ["--seconds", "0.2"], {"libraries", "relay", "simulated robot", "simulated site", *OF_ROS}),
         ("relay", ["--systems", "sern", "--cases", "1 kB", *CARRYING], {"1 kB"}),
         ("robots", ["--robots", "1", *CARRYING], {"1 robots"}),
         ("scheduler", [], {"10 topics", "100 topics", "1000 topics", "single control", "single bulk"}),
