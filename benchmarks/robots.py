@@ -218,7 +218,7 @@ def bench(options: argparse.Namespace, report: common.Report) -> None:
     report.note("data over TCP" if options.tcp else "data over the datagram lane")
     if options.figure is not None:
         _draw(options.figure, median)
-        report.note(f"figure: {options.figure}")
+        report.detail(f"figure: {options.figure}")
 
 
 def _draw(path: Path, median: dict[int, dict[str, float]]) -> None:

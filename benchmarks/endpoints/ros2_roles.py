@@ -40,7 +40,7 @@ DEPTH = 10
 """What a person writes: nothing but a depth, and so reliable and volatile."""
 WAIT_S = 60.0
 LATE_S = 2.0
-"""So long after the result feedback may still come."""
+"""Feedback may still come for so long after the result."""
 _lock = threading.Lock()
 
 

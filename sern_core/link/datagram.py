@@ -9,9 +9,9 @@ from sern_core.wire import framing
 
 MIN_SHARE_BYTES: Final = 64
 """A fragment smaller than this is not worth its header: the datagram ends instead."""
-VIEW_BYTES: Final = 8192
-"""A fragment from this size on is not cut from its message but looked at there: a copy less, which gives messages of
-1 MB 5 % more throughput. A view of little costs more than its copy."""
+VIEW_BYTES: Final = 32 * 1024
+"""A fragment from this size on is not cut from its message but looked at there: a copy less, which takes half the time
+at 64 kB and gives messages of 1 MB 5 % more throughput. Up to 16 kB a view costs as much as the copy, or more."""
 
 
 class SentData(NamedTuple):
