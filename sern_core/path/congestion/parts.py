@@ -60,6 +60,10 @@ class BaseDelay:
             self.least = deque([(now, self.least[0][1])])
             self.before_s = None
 
+    def take_over(self, other: "BaseDelay") -> None:
+        """What is known of packets of another size holds for these."""
+        self.before_s, self.noted_s, self.least = other.before_s, other.noted_s, deque(other.least)
+
     def shift(self, delay_s: float) -> None:
         """The empty path takes so much longer from now on."""
         self.least = deque([(at_s, least_s + delay_s) for at_s, least_s in self.least])
@@ -117,21 +121,24 @@ class Eased:
     What a packet takes on a link is in its delay, so one that got faster shows in the first packets over it, however
     few they are: 1,260 bytes take 34 ms at 0.3 Mbit/s and 2.5 ms at 4. What is left of the delay is compared with its
     least value of the last seconds. A queue says nothing, neither packets in it nor that it went, so it is compared
-    with packets that left when there was nothing else to send.
+    with packets that left when there was nothing else to send. Where a packet went there and its acknowledgement back
+    in less time than the link needs to send it there is nothing to compare: such a link there is not.
     """
 
-    __slots__ = ("_count", "_known_s", "_least", "_rate", "_until_s", "at_s")
+    __slots__ = ("_count", "_known_s", "_least", "_rate", "_shorter", "_until_s", "at_s")
 
     def __init__(self) -> None:
         self.at_s = -inf
         self._rate = 0.0
-        self._count = 0
+        self._count = 0  # of packets in a row that have left less than the least
+        self._shorter = 0  # of those whose round trip was less than the link takes for them
         self._least: deque[tuple[float, float]] = deque()  # (since, least) of spans of EASED_SPAN_S
         self._known_s = -inf  # the least of the spans that are over; -inf: too few
         self._until_s = -inf  # when that is another
 
-    def note(self, now: float, delay_s: float, nbytes: float, rate: float, *, queued: bool) -> None:
-        """A packet of `nbytes` came after `delay_s` over a link of `rate` bytes/s; `queued`: maybe behind others."""
+    def note(self, now: float, delay_s: float, rtt_s: float, nbytes: float, rate: float, *, queued: bool) -> None:
+        """A packet of `nbytes` came after `delay_s` over a link of `rate` bytes/s, and its acknowledgement after
+        `rtt_s`; `queued`: maybe behind others."""
         if abs(rate - self._rate) > EASED_STEADY * self._rate:
             self._rate = rate
             self._forget()
@@ -139,15 +146,14 @@ class Eased:
             self._span_over(now)
         took_s = nbytes / rate
         left_s = delay_s - took_s
-        if left_s < self._known_s - max(EASED_S, EASED_SHARE * took_s):
-            self._count += 1
-            if self._count >= EASED_PACKETS:
-                self.at_s = now
-                self._count = 0
-                self._forget()
-            return
-        self._count = 0
-        if queued:
+        least_s = max(EASED_S, EASED_SHARE * took_s)
+        shorter, early = rtt_s < took_s - least_s, left_s < self._known_s - least_s
+        self._shorter += shorter
+        self._count = self._count + 1 if early else 0
+        if self._count >= EASED_PACKETS or self._shorter >= EASED_PACKETS:
+            self.at_s = now
+            self._forget()
+        if queued or early or shorter:
             return
         least = self._least
         if not least or now >= least[-1][0] + EASED_SPAN_S:
@@ -157,6 +163,7 @@ class Eased:
             least[-1] = (least[-1][0], left_s)
 
     def _forget(self) -> None:
+        self._count = self._shorter = 0
         self._least.clear()
         self._known_s = self._until_s = -inf
 

@@ -1,20 +1,25 @@
 """The delay of the empty path, and what of an epoch's delays is a queue."""
 
 from collections import deque
+from typing import Final
 
 from sern_core.path.congestion.link_rate import LinkRate
 from sern_core.path.congestion.params import HybridParams
 from sern_core.path.congestion.parts import BaseDelay
 
+STALE_S: Final = 2.0
+"""Where no large packet has come for so long, small ones may show that the path is shorter."""
+
 
 class PathDelay:
     """The least forward delay, of small and of large packets."""
 
-    __slots__ = ("_early_s", "_large", "_leasts", "_params", "_small", "held_s")
+    __slots__ = ("_closed_s", "_early_s", "_large", "_leasts", "_params", "_small", "held_s")
 
     def __init__(self, params: HybridParams) -> None:
         self._params = params
         self._small, self._large = BaseDelay(), BaseDelay()
+        self._closed_s = 0.0  # when the last epoch was over
         self.restart()
 
     def restart(self) -> None:
@@ -45,6 +50,7 @@ class PathDelay:
 
     def close_epoch(self, now: float, window_s: float) -> None:
         """Take the 20th percentiles of the epoch for what the path may have at least."""
+        self._closed_s = now
         for base in (self._small, self._large):
             if base.epoch:
                 base.epoch.sort()
@@ -67,15 +73,30 @@ class PathDelay:
         before_s, self._early_s = self._early_s, max(0.0, early_s)
         self.held_s = max(0.0, self.held_s - min(before_s, self._early_s))
 
-    @property
-    def empty_s(self) -> float:
-        """The delay of the empty path; an epoch must have been closed."""
-        known = self._large.least or self._small.least
-        return known[0][1] + self.held_s
+    def empty_s(self, *, segmented: bool) -> float:
+        """The delay of the empty path, of large packets; an epoch must have been closed.
+
+        Fragments of a stream (`segmented`) get smaller with its rate. Then there are small packets only, and what the
+        last large ones met would be taken for the path for ever.
+        """
+        large, small = self._large.least, self._small.least
+        stale = segmented and self._closed_s > self._large.noted_s + STALE_S
+        if not large or (stale and small and small[0][1] < large[0][1]):
+            large = small
+        return large[0][1] + self.held_s
 
     def longer_packets(self, delay_s: float) -> None:
         """The largest packets take so much longer from now on."""
         self._large.shift(delay_s)
+
+    def no_large_since(self, at_s: float) -> bool:
+        """Whether there are small packets only, and were large ones before."""
+        return bool(self._large.least and self._small.least) and self._large.noted_s < at_s
+
+    def smaller_packets(self, serialise_s: float) -> None:
+        """What were small packets are the large ones from now on; the largest of them takes so long to serialise."""
+        self._large.take_over(self._small)
+        self._large.shift(serialise_s)
 
     def keep_least(self, now: float) -> None:
         """What was longer was a queue: it must not become the least when that is too old."""

@@ -1,7 +1,7 @@
 """What is known of the path: how long it is, what it takes, and what queues on it (the network path model of BBR)."""
 
 from math import inf
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from sern_core.path.capacity import AckSample
 from sern_core.path.congestion.link_rate import LinkRate, Slowdown
@@ -9,6 +9,9 @@ from sern_core.path.congestion.params import HybridParams
 from sern_core.path.congestion.parts import Eased
 from sern_core.path.congestion.path_delay import PathDelay
 from sern_core.path.congestion.queue_view import QueueView
+
+SHORTER: Final = 0.1
+"""A path of which no packet of an epoch took more than this share of its round trip got shorter."""
 
 
 class Seen(NamedTuple):
@@ -40,6 +43,7 @@ class PathModel:
         "_known_fragment",
         "_last",
         "_limited",
+        "_longest_rtt_s",
         "_params",
         "_samples",
         "delay",
@@ -78,6 +82,7 @@ class PathModel:
         self._samples: list[tuple[float, float]] = []  # (queue, way back) of the epoch
         self._gaps: list[float] = []  # seconds a byte between acknowledgements of the epoch, at the receiver
         self._last: tuple[float, int] | None = None  # (time, bytes) at the receiver, of the latest of them
+        self._longest_rtt_s = 0.0  # of the epoch
         self._limited = 0  # acknowledgements of packets after which there was more to send
         self.longest = 0
         """Bytes of the longest packet of the epoch."""
@@ -107,10 +112,12 @@ class PathModel:
             delay_s = receiver_s - sent_s
         queue_s = self.delay.queue_s(delay_s, nbytes, self.fragment, rate, overtook=sample.overtook)
         self._samples.append((queue_s, rtt_s - delay_s))
+        if rtt_s > self._longest_rtt_s:
+            self._longest_rtt_s = rtt_s
         carried = rate.value
         if carried is not None and rate.saturated:
             queued = not sample.app_limited or queue_s > self.fragment / carried
-            self.eased.note(sample.now, receiver_s - sent_s, nbytes or self.fragment, carried, queued=queued)
+            self.eased.note(sample.now, receiver_s - sent_s, rtt_s, nbytes or self.fragment, carried, queued=queued)
         last, self._last = self._last, (receiver_s, sample.cum_bytes)
         if last is not None and (came_bytes := sample.cum_bytes - last[1]) > 0:
             self._gaps.append(max(0.0, receiver_s - last[0]) / came_bytes)
@@ -148,7 +155,10 @@ class PathModel:
         params, view, count = self._params, self.view, len(self._samples)
         if self.epoch_s is None or count < params.min_epoch_samples:
             return False
-        lasted_s, least_s = now - self.epoch_s, max(params.min_epoch_s, self.rtt_s or 0.0)
+        rtt_s = self.rtt_s or 0.0
+        if self._longest_rtt_s < SHORTER * rtt_s:
+            rtt_s = self._longest_rtt_s  # the path got shorter
+        lasted_s, least_s = now - self.epoch_s, max(params.min_epoch_s, rtt_s)
         if view.jittery and not view.calm and count < params.jittery_epoch_samples:
             least_s *= params.jittery_epochs
         return lasted_s >= least_s
@@ -166,9 +176,12 @@ class PathModel:
         early_s = -queues[count // 5]
         early = early_s > view.high_s
         delay.close_epoch(now, memory_s)
+        if self.segmented and delay.no_large_since(now - memory_s):
+            self._shorten_fragment()
+            delay.smaller_packets(self.fragment / self.rate.peak if self.rate.peak else 0.0)
         quicker = delay.got_quicker(view.serialise_s)
         delay.came_early(early_s)
-        rtt_s = self.rtt_s = max(1e-5, delay.empty_s + backs[count // 2])
+        rtt_s = self.rtt_s = max(1e-5, delay.empty_s(segmented=self.segmented) + backs[count // 2])
         self.rate.decay(now - (self.epoch_s or now))
         usual = fragment <= self._first_fragment_bytes
         limited = 2 * self._limited >= count
@@ -202,6 +215,7 @@ class PathModel:
         self._samples.clear()
         self._gaps.clear()
         self._limited = self.longest = 0
+        self._longest_rtt_s = 0.0
         self.epoch_s = now
 
     def _look_for_end_of_queue(self, now: float, window: float) -> None:
@@ -227,7 +241,7 @@ class PathModel:
         self.delay.longer_packets(self.fragment / rate - before / faster)
 
     def _shorten_fragment(self) -> None:
-        """The fragments of a stream get shorter with its rate."""
+        """What there is to send got shorter: the fragments of a stream do with its rate."""
         self.fragment = min(self.fragment, max(self.longest, self._first_fragment_bytes))
         self._known_fragment = min(self._known_fragment, self.fragment)
 

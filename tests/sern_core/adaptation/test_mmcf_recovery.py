@@ -86,6 +86,37 @@ def test_within_five_seconds_of_its_return_a_link_carries_what_it_did(
     r.world.validate()
 
 
+@pytest.mark.parametrize(
+    ("falls_s", "thin_s", "thin_bps"),
+    [(2.0, 5.5, 0.3e6), (4.2, 9.4, 0.2e6), (4.1, 15.9, 0.2e6), *also((2.3, 12.1, 0.2e6), (4.5, 22.6, 0.3e6))],
+)
+def test_what_summaries_alone_fill_is_found_to_be_wide_again(falls_s: float, thin_s: float, thin_bps: float) -> None:
+    """Nothing but a cloud, over a stream: the packets of its summary are all that there is to see the link by, and they
+    are smaller than those of the clouds, which had a queue of seconds."""
+    high_bps, rate_hz = 20e6, 10.0
+    steps = (RateStep(falls_s, thin_bps), RateStep(falls_s + thin_s, high_bps))
+    model = LinkModel(rate_bps=high_bps, delay_s=0.005, rate_steps=steps)
+    items: list[Thinned] = []
+    policy = Mmcf(
+        LEVELS,
+        weights=WEIGHTS,
+        ranges=Ranges(),
+        floors=FLOORS,
+        initial=Configuration(queues=(10, 10, 10), summaries=ALL_RAW),
+    )
+    r = rig(policy, model, link=LinkParams(), summaries=items)
+    cloud = r.robot.publish("/robot/points", spec(BULK, depth=1, lifespan_s=1.0))
+    item = Thinned(r.robot, cloud, cloud, part=0.1)
+    items.append(item)
+    r.world.network.every(1.0 / rate_hz, lambda now: item.offer(BODY, now), node=r.robot)
+    back_s = falls_s + thin_s
+    r.world.run(back_s + 10.0)
+    rtprop_s = r.robot.core.link.lanes.lane.estimator.rtprop_s
+    assert rtprop_s is not None and rtprop_s < 0.03, "the path is as short as before"
+    assert clouds_in(r, back_s + 5.0, back_s + 10.0) >= 0.8 * rate_hz * 5.0
+    r.world.validate()
+
+
 @pytest.mark.parametrize("lossless", [False, True], ids=["datagrams", "stream"])
 def test_a_wide_link_that_was_never_full_is_not_taken_to_be_as_narrow_as_what_was_offered(*, lossless: bool) -> None:
     """Many small messages, one after the other: there is never more to send than the link takes."""

@@ -19,32 +19,39 @@ class Path:
         self.window = 1e6
         self._cum_bytes = 0
 
-    def packet(self, queue_s: float = 0.0, *, app_limited: bool = False, overtook: bool = False) -> AckSample:
+    def packet(
+        self,
+        queue_s: float = 0.0,
+        *,
+        app_limited: bool = False,
+        overtook: bool = False,
+        nbytes: int = FRAGMENT_BYTES,
+    ) -> AckSample:
         """One packet more has arrived, and queued for so long."""
-        self.now += FRAGMENT_BYTES / self.rate
-        self._cum_bytes += FRAGMENT_BYTES
+        self.now += nbytes / self.rate
+        self._cum_bytes += nbytes
         sent_s = self.now - RTT_S - queue_s
         received_s = 7e4 + sent_s + RTT_S / 2 + queue_s
         return AckSample(
             self.now,
             RTT_S + queue_s,
-            FRAGMENT_BYTES,
+            nbytes,
             20_000,
             received_s,
             self._cum_bytes,
             app_limited,
             sent_s,
-            FRAGMENT_BYTES,
+            nbytes,
             overtook,
         )
 
-    def epoch(self, queue_s: float = 0.0, *, app_limited: bool = False) -> Seen:
+    def epoch(self, queue_s: float = 0.0, *, app_limited: bool = False, nbytes: int = FRAGMENT_BYTES) -> Seen:
         """Packets that queue alike, until an epoch is over."""
         model = self.model
         if model.epoch_s is None:
             model.begin_epoch(self.now)
         while not model.epoch_over(self.now):
-            sample = self.packet(queue_s, app_limited=app_limited)
+            sample = self.packet(queue_s, app_limited=app_limited, nbytes=nbytes)
             model.note(sample)
             carried = model.rate.measure(
                 sample.receiver_s, sample.cum_bytes, app_limited=app_limited, held=False, rtt_s=model.rtt_s or 0.0

@@ -4,7 +4,8 @@ import pytest
 
 from sern_core.path.congestion.link_rate import SPAN_PACKETS, Slowdown
 from sern_core.path.congestion.params import DEFAULT_HYBRID
-from tests.sern_core.path.congestion.acknowledged import FRAGMENT_BYTES, RTT_S, Path
+from sern_core.path.congestion.path_delay import STALE_S
+from tests.sern_core.path.congestion.acknowledged import FRAGMENT_BYTES, MEMORY_S, RTT_S, Path
 
 
 def test_an_epoch_lasts_for_a_round_trip_and_shows_the_queue() -> None:
@@ -76,6 +77,54 @@ def test_a_longer_path_is_no_queue_any_more() -> None:
     assert path.epoch(0.03).queue_s == pytest.approx(0.0, abs=1e-6)
 
 
+LARGE_BYTES, LONG_S = 12_000, 8.0
+
+
+def _long_with_large_packets() -> Path:
+    """Large packets have found a queue of 8 s for longer than the least delay counts; then it has gone, and there are
+    small ones only."""
+    path = Path()
+    path.model.larger_packet(LARGE_BYTES)
+    for _ in range(20):
+        path.epoch(nbytes=LARGE_BYTES)
+        path.epoch()
+    until_s = path.now + MEMORY_S + 1.0
+    while path.now < until_s:
+        path.epoch(LONG_S, nbytes=LARGE_BYTES)
+    assert path.model.rtt_s is not None and path.model.rtt_s > LONG_S
+    return path
+
+
+def test_small_packets_show_that_the_path_is_short_again_though_no_large_one_goes_any_more() -> None:
+    path = _long_with_large_packets()
+    gone_s = path.now
+    while path.model.rtt_s is None or path.model.rtt_s > 2 * RTT_S:
+        path.epoch(app_limited=True)
+        assert path.now < gone_s + STALE_S + 0.5
+
+
+def test_what_has_not_been_sent_for_as_long_as_the_least_delay_counts_is_not_what_there_is_to_send() -> None:
+    path = _long_with_large_packets()
+    until_s = path.now + MEMORY_S + 1.0
+    while path.now < until_s:
+        path.model.longest = FRAGMENT_BYTES
+        path.epoch()
+    assert path.model.fragment == FRAGMENT_BYTES
+    assert path.epoch(0.02).queue_s == pytest.approx(0.02, abs=1e-3), "they are the large ones now"
+
+
+def test_a_large_packet_now_and_then_is_still_what_there_is_to_send() -> None:
+    path = _long_with_large_packets()
+    for _ in range(10):
+        path.model.longest = LARGE_BYTES
+        path.epoch(nbytes=LARGE_BYTES)
+        until_s = path.now + MEMORY_S / 2
+        while path.now < until_s:
+            path.model.longest = FRAGMENT_BYTES
+            path.epoch()
+    assert path.model.fragment == LARGE_BYTES
+
+
 def test_packets_that_come_sooner_than_over_the_empty_path_are_noticed() -> None:
     path = Path().settled()
     path.epoch(0.05)
@@ -87,10 +136,10 @@ def test_packets_that_come_sooner_than_over_the_empty_path_are_noticed() -> None
 def test_a_larger_packet_takes_longer_and_is_no_queue_for_it() -> None:
     path = Path().settled()
     rate = path.model.rate.peak
-    base_s = path.model.delay.empty_s
+    base_s = path.model.delay.empty_s(segmented=False)
     path.model.larger_packet(2 * FRAGMENT_BYTES)
     assert path.model.fragment == 2 * FRAGMENT_BYTES
-    assert path.model.delay.empty_s - base_s == pytest.approx(FRAGMENT_BYTES / rate)
+    assert path.model.delay.empty_s(segmented=False) - base_s == pytest.approx(FRAGMENT_BYTES / rate)
 
 
 @pytest.mark.parametrize("jitter", [True, False])
